@@ -1,0 +1,78 @@
+"""The agent: everything that a run changes, and the record of one of its episodes."""
+
+import dataclasses
+from typing import NamedTuple
+
+import keras
+import numpy as np
+
+from dqn_keras.config import Config, count
+from dqn_keras.networks import make_networks
+from dqn_keras.replay import ReplayMemory
+
+
+@dataclasses.dataclass
+class Agent:
+    """What learns, and all that it carries from one episode to the next."""
+
+    seed: int
+    q_network: keras.Sequential
+    q_hat_network: keras.Sequential
+    optimizer: keras.Optimizer
+    memory: ReplayMemory
+    rng: np.random.Generator
+    """The source of every random draw of acting and sampling."""
+    epsilon: float
+    """Probability of a random action in the next episode."""
+    num_episodes: int = 0
+    """Episodes played: the number of the next one."""
+    num_updates: int = 0
+    """Gradient steps taken."""
+
+
+class Episode(NamedTuple):
+    """What happened in one episode."""
+
+    number: int
+    """Counted from 0."""
+    reward: float
+    """Sum of its rewards, undiscounted."""
+    steps: int
+    epsilon: float
+    """With which it was played."""
+    loss: float
+    """Mean over its updates; NaN if it had none."""
+
+
+def make_agent(num_features: int, num_actions: int, config: Config, seed: int) -> Agent:
+    """An agent that has seen nothing; weights and random stream follow from `seed` alone."""
+    q_network, q_hat_network = make_networks(num_features, num_actions, config.hidden_units, _derived(seed, 0))
+    optimizer = keras.optimizers.Adam(learning_rate=config.alpha)
+    q_network.compile(optimizer=optimizer, loss="mse")  # Keras' callbacks and .keras files look for it there
+    optimizer.build(q_network.trainable_variables)
+    return Agent(
+        seed=seed,
+        q_network=q_network,
+        q_hat_network=q_hat_network,
+        optimizer=optimizer,
+        memory=ReplayMemory(config.memory_size, num_features),
+        rng=np.random.default_rng(_derived(seed, 1)),
+        epsilon=config.epsilon,
+    )
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """The seed of `env.reset` for one episode of a run: any episode can be begun again exactly."""
+    return int(_derived(seed, 2, episode).generate_state(1)[0])
+
+
+def checked_seed(seed: int | None) -> int:
+    """`seed` as an int; a fresh random one for None."""
+    if seed is None:
+        return int(np.random.SeedSequence().generate_state(1)[0] >> 1)
+    return count("seed", seed, at_least=0)
+
+
+def _derived(seed: int, *key: int) -> np.random.SeedSequence:
+    """One of the independent streams that belong to `seed`: 0 weights, 1 draws, (2, k) the start of episode k."""
+    return np.random.SeedSequence(seed, spawn_key=key)

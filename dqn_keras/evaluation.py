@@ -1,0 +1,44 @@
+"""Greedy episodes: what the network is worth without exploration."""
+
+import gymnasium as gym
+import keras
+import numpy as np
+
+from dqn_keras.agent import checked_seed
+from dqn_keras.config import count
+from dqn_keras.environment import CheckedEnv
+from dqn_keras.networks import check_fits, q_function
+
+
+def evaluate(
+    env: gym.Env, q_network: keras.Model, num_episodes: int = 100, seed: int | None = None, max_steps: int = 1_000
+) -> np.ndarray:
+    """Play greedily, learn nothing: the undiscounted return of each episode, [num_episodes] float64.
+
+    Args:
+        env: as for `train`.
+        q_network: states [B, F] -> Q-values [B, A].
+        num_episodes: how many.
+        seed: episode k starts from a state that follows from (seed, k); None draws a seed.
+        max_steps: steps after which an episode is left, if the environment has not ended it.
+
+    Raises:
+        TypeError, ValueError: as for `train`; or the network does not fit the environment.
+    """
+    checked_env = CheckedEnv(env)
+    check_fits(q_network, checked_env.num_features, checked_env.num_actions)
+    num_episodes, max_steps, seed = (
+        count("num_episodes", num_episodes),
+        count("max_steps", max_steps),
+        checked_seed(seed),
+    )
+    q_values = q_function(q_network)
+    returns = np.zeros(num_episodes)
+    for episode in range(num_episodes):
+        state = checked_env.reset(seed, episode)
+        for _ in range(max_steps):
+            state, reward, terminated, truncated = checked_env.step(int(q_values(state).argmax()))
+            returns[episode] += reward
+            if terminated or truncated:
+                break
+    return returns

@@ -1,0 +1,77 @@
+"""Frames of an episode, and the moving picture they make: no window, no display, no video encoder."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+import gymnasium as gym
+import keras
+import numpy as np
+from PIL import Image
+
+from dqn_keras.agent import checked_seed
+from dqn_keras.config import count
+from dqn_keras.environment import CheckedEnv
+from dqn_keras.networks import check_fits, q_function
+
+if TYPE_CHECKING:
+    import IPython.display
+
+
+def record_episode(
+    env: gym.Env, q_network: keras.Model, seed: int | None = None, max_steps: int = 1_000
+) -> list[np.ndarray]:
+    """Play one greedy episode: a frame [H, W, 3] uint8 of every state, the first and the last included.
+
+    It is the first episode of `evaluate(env, q_network, seed=seed)`. The environment must be made with
+    `render_mode="rgb_array"`, which needs no display; ValueError otherwise.
+    """
+    checked_env = CheckedEnv(env)
+    check_fits(q_network, checked_env.num_features, checked_env.num_actions)
+    if env.render_mode != "rgb_array":
+        raise ValueError(f'env must be made with render_mode="rgb_array", got {env.render_mode!r}')
+    q_values = q_function(q_network)
+    state = checked_env.reset(checked_seed(seed), episode=0)
+    frames = [np.asarray(env.render())]
+    for _ in range(count("max_steps", max_steps)):
+        state, _, terminated, truncated = checked_env.step(int(q_values(state).argmax()))
+        frames.append(np.asarray(env.render()))
+        if terminated or truncated:
+            break
+    return frames
+
+
+def save_animation(
+    frames: Sequence[np.ndarray],
+    file: str | Path | BinaryIO,
+    fps: int = 50,
+    width: int = 300,
+    format: str | None = None,
+) -> None:
+    """Write frames as one moving picture that loops, every second frame left out, `fps` frames a second in all.
+
+    Args:
+        frames: [H, W, 3] uint8 each.
+        file: path or open binary file.
+        fps: frames per second of the episode (CartPole's is 50).
+        width: pixels; the height follows.
+        format: "PNG" or "GIF"; by default what the suffix of the path says.
+    """
+    if not len(frames):
+        raise ValueError("frames must hold at least one frame, got none")
+    height, full_width = frames[0].shape[:2]
+    size = (width, round(height * width / full_width))
+    images = [Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS) for frame in frames[::2]]
+    palette = images[0].quantize(colors=32)  # one palette for all, so that frames differ only where things move
+    first, *rest = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    first.save(file, format=format, save_all=True, append_images=rest, duration=round(2000 / fps), loop=0)
+
+
+def animate(frames: Sequence[np.ndarray], fps: int = 50, width: int = 300) -> "IPython.display.Image":
+    """The moving picture as a notebook shows it: an animated PNG, kept in the .ipynb, that any browser plays."""
+    from IPython.display import Image as InlineImage  # only a notebook has need of it
+
+    buffer = io.BytesIO()
+    save_animation(frames, buffer, fps, width, format="PNG")
+    return InlineImage(data=buffer.getvalue(), format="png")

@@ -1,0 +1,70 @@
+"""The original notebook's algorithm once more: plain, eager, slow, and independent of the package.
+
+It reads like the original: a deque of named tuples, a Keras call per state, a tf.function with the networks in
+its closure. What the original left to chance comes in as arguments, so that two programs can be given the same:
+the networks with their weights, the random generator, and the seed of each episode's reset.
+"""
+
+from collections import deque, namedtuple
+
+import numpy as np
+import tensorflow as tf
+from keras.losses import mean_squared_error
+from keras.optimizers import Adam
+
+MEMORY_SIZE = 50_000
+STEPS_PER_UPDATE = 4
+ALPHA = 0.001
+GAMMA = 0.95
+TAU = 0.01
+BATCH_SIZE = 64
+DECAY = 0.995
+EPSILON_MIN = 0.1
+MAX_STEPS = 1_000
+
+Transition = namedtuple("Transition", "state action reward next_state terminal_state")
+
+
+def run(env, q_network, q_hat_network, rng, reset_seed, memory_size=MEMORY_SIZE, epsilon=1.0):
+    """Yield (step's action, reward, episode ended) for ever; the networks learn on the way."""
+    optimizer = Adam(learning_rate=ALPHA)
+    optimizer.build(q_network.trainable_variables)
+
+    @tf.function
+    def learn(states, actions, rewards, next_states, terminal_states):
+        with tf.GradientTape() as tape:
+            best_next = tf.reduce_max(q_hat_network(next_states), axis=-1)
+            y = rewards + (1 - terminal_states) * GAMMA * best_next
+            pairs = tf.stack([tf.range(BATCH_SIZE), actions], axis=1)
+            loss = mean_squared_error(y, tf.gather_nd(q_network(states), pairs))
+        weights = q_network.trainable_variables
+        optimizer.apply_gradients(zip(tape.gradient(loss, weights), weights, strict=True))
+        for q_hat, q in zip(q_hat_network.weights, q_network.weights, strict=True):
+            q_hat.assign(TAU * q + (1 - TAU) * q_hat)
+
+    memory = deque(maxlen=memory_size)
+    episode = 0
+    while True:
+        state, _ = env.reset(seed=reset_seed(episode))
+        for t in range(MAX_STEPS):
+            values = q_network(np.expand_dims(state, axis=0))
+            a = rng.integers(values.shape[1]) if rng.random() < epsilon else np.argmax(values)
+            next_state, reward, terminated, truncated, _ = env.step(a)
+            memory.append(Transition(state, a, reward, next_state, terminated))
+            if t % STEPS_PER_UPDATE == 0 and len(memory) >= BATCH_SIZE:
+                chosen = rng.choice(len(memory), size=BATCH_SIZE, replace=False)
+                batch = [memory[i] for i in chosen]
+                learn(
+                    tf.constant(np.array([x.state for x in batch], np.float32)),
+                    tf.constant(np.array([x.action for x in batch], np.int32)),
+                    tf.constant(np.array([x.reward for x in batch], np.float32)),
+                    tf.constant(np.array([x.next_state for x in batch], np.float32)),
+                    tf.constant(np.array([x.terminal_state for x in batch], np.float32)),
+                )
+            state = next_state.copy()
+            yield int(a), float(reward), terminated or truncated
+            if terminated or truncated:
+                break
+        if epsilon > EPSILON_MIN:
+            epsilon = max(epsilon * DECAY, EPSILON_MIN)
+        episode += 1

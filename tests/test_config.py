@@ -1,0 +1,113 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dqn_keras import Config
+
+COUNTS = ["memory_size", "steps_per_update", "batch_size", "num_episodes", "max_steps", "solved_window"]
+SHARES = ["alpha", "gamma", "tau", "epsilon", "decay", "epsilon_min"]
+ZERO_IS_FINE = ["gamma", "epsilon", "epsilon_min"]
+
+
+def test_defaults_are_the_originals_numbers():
+    assert dataclasses.asdict(Config()) == {
+        "memory_size": 50_000,
+        "steps_per_update": 4,
+        "alpha": 0.001,
+        "gamma": 0.95,
+        "tau": 0.01,
+        "batch_size": 64,
+        "epsilon": 1.0,
+        "decay": 0.995,
+        "epsilon_min": 0.1,
+        "num_episodes": 2_000,
+        "max_steps": 1_000,
+        "solved_reward": 225.0,
+        "solved_window": 50,
+        "hidden_units": (64,),
+        "jit_compile": True,
+    }
+
+
+def refused(name, value):
+    with pytest.raises((TypeError, ValueError)) as caught:
+        Config(**{name: value})
+    message = str(caught.value)
+    assert message.startswith(name), message
+    assert repr(value) in message, message
+
+
+not_numbers = st.sampled_from([None, "64", b"1", True, False, np.True_, [1], (), {}, 1j, object()])
+not_finite = st.sampled_from([float("nan"), float("inf"), -float("inf"), np.float32("nan"), np.float64("inf")])
+
+
+@given(
+    st.sampled_from(COUNTS), st.one_of(not_numbers, not_finite, st.floats(), st.integers(max_value=0), st.just(2**31))
+)
+def test_a_bad_count_is_refused_by_name(name, value):
+    refused(name, value)
+
+
+@given(
+    st.sampled_from(SHARES),
+    st.one_of(not_numbers, not_finite, st.floats(max_value=-1e-300), st.floats(min_value=1.0001), st.just(10**400)),
+)
+def test_a_bad_share_is_refused_by_name(name, value):
+    refused(name, value)
+
+
+@pytest.mark.parametrize("name", [name for name in SHARES if name not in ZERO_IS_FINE])
+def test_zero_is_refused_where_nothing_would_be_learned(name):
+    refused(name, 0.0)
+
+
+@given(st.one_of(not_numbers, not_finite))
+def test_a_bad_solved_reward_is_refused_by_name(value):
+    refused("solved_reward", value)
+
+
+@pytest.mark.parametrize(
+    "value", [64, None, "64", (), [], (0,), (64, -1), (64.0,), (True,), ("64",), {64}, np.ones((2, 2))]
+)
+def test_bad_hidden_units_are_refused_by_name(value):
+    with pytest.raises((TypeError, ValueError), match=r"^hidden_units"):
+        Config(hidden_units=value)
+
+
+@pytest.mark.parametrize("value", [1, 0, None, "yes"])
+def test_bad_jit_compile_is_refused_by_name(value):
+    refused("jit_compile", value)
+
+
+def test_rules_that_join_two_fields():
+    with pytest.raises(ValueError, match=r"^batch_size .*memory_size=63, got 64"):
+        Config(memory_size=63)
+    with pytest.raises(ValueError, match=r"^batch_size .*= 60, got 64"):
+        Config(num_episodes=6, max_steps=10)
+    with pytest.raises(ValueError, match=r"^epsilon_min .* 0.05, got 0.1"):
+        Config(epsilon=0.05)
+
+
+def test_numpy_scalars_become_pythons():
+    config = Config(
+        batch_size=np.int64(32),
+        gamma=np.float32(0.5),
+        solved_reward=np.int32(100),
+        hidden_units=np.array([8, 9]),
+        jit_compile=np.bool_(False),
+    )
+    assert config == Config(batch_size=32, gamma=0.5, solved_reward=100.0, hidden_units=(8, 9), jit_compile=False)
+    assert [type(x) for x in (config.batch_size, config.gamma, config.hidden_units[0], config.jit_compile)] == [
+        int,
+        float,
+        int,
+        bool,
+    ]
+
+
+def test_config_cannot_be_changed():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Config().gamma = 0.5

@@ -1,0 +1,147 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from dqn_keras import Config
+from dqn_keras.agent import episode_seed, make_agent
+from dqn_keras.environment import CheckedEnv
+from dqn_keras.gymnasium_loop import episodes
+from tests import original_algorithm
+from tests.environments import Corridor
+
+
+class Recorded(gym.Wrapper):
+    """Writes down every action."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.actions = []
+
+    def step(self, action):
+        self.actions.append(int(action))
+        return super().step(action)
+
+
+def play(env, config, seed, num_steps):
+    """Whole episodes of the loop until at least `num_steps` are played."""
+    checked = CheckedEnv(env)
+    agent = make_agent(checked.num_features, checked.num_actions, config, seed)
+    played = []
+    for episode in episodes(checked, agent, config):
+        played.append(episode)
+        if sum(e.steps for e in played) >= num_steps:
+            break
+    return agent, played
+
+
+@pytest.mark.parametrize(("seed", "memory_size"), [(0, 50_000), (1, 50_000), (2, 500)], ids=["", "", "full memory"])
+def test_the_loop_is_the_originals_algorithm_step_for_step(cartpole, seed, memory_size):
+    env = Recorded(cartpole)
+    agent, played = play(env, Config(memory_size=memory_size), seed, 2_000)
+    actions = env.actions
+
+    twin = make_agent(4, 2, Config(), seed)
+    env.actions = []
+    original = original_algorithm.run(
+        env, twin.q_network, twin.q_hat_network, twin.rng, lambda k: episode_seed(seed, k), memory_size
+    )
+    rewards, total = [], 0.0
+    while len(rewards) < len(played):
+        _, reward, over = next(original)
+        total += reward
+        if over:
+            rewards.append(total)
+            total = 0.0
+
+    assert len(actions) >= 2_000
+    assert actions == env.actions
+    assert [e.reward for e in played] == rewards
+    for ours, theirs in [(agent.q_network, twin.q_network), (agent.q_hat_network, twin.q_hat_network)]:
+        for a, b in zip(ours.get_weights(), theirs.get_weights(), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-4, rtol=0)
+    assert agent.rng.bit_generator.state == twin.rng.bit_generator.state
+
+
+def test_updates_fall_on_every_fourth_step_of_an_episode_once_a_batch_is_there():
+    # episodes of 6 steps learn at t = 0 and 4; the memory holds 8 transitions from step 1 of episode 1 on
+    env = Corridor(length=100, limit=6)
+    agent, played = play(env, Config(batch_size=8), 0, 18)
+    assert [np.isnan(e.loss) for e in played] == [True, False, False]
+    assert agent.num_updates == 1 + 2
+    assert agent.optimizer.iterations.numpy() == 3
+
+
+def test_truncation_keeps_the_bootstrap_and_termination_does_not():
+    truncated, _ = play(Corridor(length=100, limit=3), Config(), 0, 9)
+    assert truncated.memory.sample(9, np.random.default_rng(0)).terminal_state.tolist() == [0.0] * 9
+    terminated, _ = play(Corridor(length=1), Config(), 0, 20)
+    batch = terminated.memory.sample(len(terminated.memory), np.random.default_rng(0))
+    np.testing.assert_array_equal(batch.terminal_state, batch.next_state[:, 0] >= 1)
+    assert batch.terminal_state.any()
+
+
+def test_an_episode_is_left_after_max_steps():
+    _, played = play(Corridor(length=100), Config(max_steps=7), 0, 14)
+    assert [e.steps for e in played] == [7, 7]
+
+
+def test_epsilon_falls_once_an_episode():
+    _, played = play(Corridor(limit=2), Config(epsilon=0.5, decay=0.5, epsilon_min=0.2), 0, 6)
+    assert [e.epsilon for e in played] == [0.5, 0.25, 0.2]
+
+
+def test_each_reset_is_seeded_from_the_run_and_the_episode():
+    env = Corridor(length=1)
+    play(env, Config(), 3, 8)
+    assert env.reset_seeds == [episode_seed(3, k) for k in range(len(env.reset_seeds))]
+    assert len(set(env.reset_seeds)) == len(env.reset_seeds)
+    assert episode_seed(3, 1) != episode_seed(4, 1)
+    assert type(env.reset_seeds[0]) is int
+
+
+def test_actions_are_counted_from_where_the_space_starts():
+    env = Corridor(length=3, action_space=gym.spaces.Discrete(2, start=1))
+    agent, _ = play(env, Config(), 0, 20)
+    assert set(env.actions) == {1, 2}
+    assert set(agent.memory.sample(20, np.random.default_rng(0)).action) == {0, 1}
+
+
+def test_a_reused_observation_buffer_does_no_harm():
+    buffer = np.zeros(2, np.float32)
+
+    def observe(position, t):
+        buffer[:] = position, t
+        return buffer
+
+    agent, _ = play(Corridor(length=100, limit=5, observe=observe), Config(), 0, 10)
+    batch = agent.memory.sample(10, np.random.default_rng(0))
+    np.testing.assert_array_equal(batch.next_state[:, 1] - batch.state[:, 1], 1)
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e39])
+def test_a_bad_number_stops_the_run_at_once_and_says_where(bad):
+    reward = Corridor(limit=4, reward=lambda t: bad if t == 2 else 1.0)
+    with pytest.raises(ValueError, match=r"env Corridor: the reward must be finite.* in episode 0, step 2"):
+        play(reward, Config(), 0, 100)
+    observation = Corridor(length=100, limit=4, observe=lambda position, t: np.array([bad if t == 3 else 0.0, 0.0]))
+    with pytest.raises(ValueError, match=r"env Corridor: the observation must be finite.* in episode 0, step 2"):
+        play(observation, Config(), 0, 100)
+    at_reset = Corridor(observe=lambda position, t: np.array([bad, 0.0]))
+    with pytest.raises(ValueError, match=r"must be finite.* in episode 0, at the reset"):
+        play(at_reset, Config(), 0, 100)
+
+
+def test_large_but_finite_numbers_pass():
+    play(Corridor(length=1, observe=lambda position, t: np.array([1e30, -1e30], np.float32)), Config(), 0, 5)
+
+
+def test_weights_that_become_nan_stop_the_run_in_the_same_update(cartpole):
+    checked, config = CheckedEnv(cartpole), Config()
+    agent = make_agent(4, 2, config, 0)
+    loop = episodes(checked, agent, config)
+    for _ in range(10):
+        next(loop)
+    agent.q_hat_network.weights[0].assign(np.full((4, 64), np.nan))
+    with pytest.raises(ValueError, match=r"the loss became nan in episode 10, step 0: learning has diverged"):
+        next(loop)

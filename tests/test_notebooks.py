@@ -1,0 +1,44 @@
+import importlib.util
+from pathlib import Path
+
+import nbformat
+import pytest
+
+NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
+spec = importlib.util.spec_from_file_location("render", NOTEBOOKS / "render.py")
+render = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(render)
+
+
+def rendered(source):
+    return nbformat.read(source.with_suffix(".ipynb"), as_version=4)
+
+
+def inputs(notebook):
+    return [(cell.cell_type, cell.source, cell.metadata.get("tags", [])) for cell in notebook.cells]
+
+
+def test_every_notebook_has_its_script():
+    assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == {path.stem for path in render.sources()}
+    assert render.sources()
+
+
+@pytest.mark.parametrize("source", render.sources(), ids=lambda path: path.stem)
+def test_the_rendered_notebook_is_of_its_script(source):
+    assert inputs(rendered(source)) == inputs(render.convert(source)), f"run: make notebook ({source.name} has changed)"
+
+
+@pytest.mark.parametrize("source", render.sources(), ids=lambda path: path.stem)
+def test_the_rendered_notebook_is_whole_quiet_and_small(source):
+    cells = [cell for cell in rendered(source).cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    outputs = [output for cell in cells for output in cell.outputs]
+    assert not [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"]
+    assert source.with_suffix(".ipynb").stat().st_size < 1_500_000
+
+
+def test_the_main_notebook_shows_a_solved_run_and_a_moving_pole():
+    outputs = [x for cell in rendered(NOTEBOOKS / "deep_q_network.py").cells for x in cell.get("outputs", [])]
+    assert any("Solved with" in output.get("text", "") for output in outputs)
+    saved = (NOTEBOOKS.parent / "results" / "pole.png").read_bytes()
+    assert b"acTL" in saved[:200]  # the chunk that marks an animated PNG

@@ -1,0 +1,84 @@
+import gymnasium as gym
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from PIL import Image
+
+from dqn_keras import animate, evaluate, make_q_network, plot_rewards, record_episode, save_animation
+
+mpl.use("Agg")
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    yield
+    plt.close("all")
+
+
+def test_the_curve_shows_the_rewards_and_their_mean_over_the_last_twenty():
+    rewards = np.arange(30.0)
+    ax = plot_rewards(rewards)
+    raw, smoothed = ax.get_lines()
+    np.testing.assert_array_equal(raw.get_ydata(), rewards)
+    np.testing.assert_array_equal(smoothed.get_xdata(), np.arange(19, 30))
+    np.testing.assert_allclose(smoothed.get_ydata(), [rewards[k - 19 : k + 1].mean() for k in range(19, 30)])
+    assert ax.get_xlabel() == "Episode"
+    assert "Reward" in ax.get_ylabel()
+
+
+def test_the_curve_of_a_short_run_has_no_mean():
+    assert len(plot_rewards([1.0, 2.0]).get_lines()) == 1
+
+
+def test_the_curve_goes_where_it_is_told():
+    _, ax = plt.subplots()
+    assert plot_rewards([1.0], ax) is ax
+
+
+def test_bad_rewards_and_windows_are_refused():
+    with pytest.raises(ValueError, match=r"^rewards must have one axis, got shape \(1, 2\)"):
+        plot_rewards([[1.0, 2.0]])
+    with pytest.raises(ValueError, match=r"^window"):
+        plot_rewards([1.0], window=0)
+
+
+def test_a_recorded_episode_is_the_first_that_evaluate_plays():
+    env, network = gym.make("CartPole-v1", render_mode="rgb_array"), make_q_network(4, 2, seed=0)
+    frames = record_episode(env, network, seed=3)
+    assert len(frames) == evaluate(env, network, 1, seed=3)[0] + 1
+    assert frames[0].shape == (400, 600, 3)
+    assert not np.array_equal(frames[0], frames[-1])
+
+
+def test_recording_without_frames_says_how_to_get_them(cartpole):
+    with pytest.raises(ValueError, match='env must be made with render_mode="rgb_array", got None'):
+        record_episode(cartpole, make_q_network(4, 2))
+
+
+@pytest.fixture
+def frames():
+    """A white square that moves over black, 9 frames."""
+    pictures = np.zeros((9, 40, 60, 3), np.uint8)
+    for k, picture in enumerate(pictures):
+        picture[10:20, 5 * k : 5 * k + 10] = 255
+    return list(pictures)
+
+
+@pytest.mark.parametrize("suffix", ["gif", "png"])
+def test_an_animation_plays_every_second_frame_in_the_episodes_time(frames, suffix, tmp_path):
+    save_animation(frames, tmp_path / f"square.{suffix}", fps=50, width=30)
+    with Image.open(tmp_path / f"square.{suffix}") as picture:
+        assert (picture.n_frames, picture.size, picture.info["loop"]) == (5, (30, 20), 0)
+        assert picture.info["duration"] == 40
+
+
+def test_an_inline_animation_is_an_animated_png(frames):
+    shown = animate(frames)
+    assert shown.format == "png"
+    assert b"acTL" in shown.data[:200]  # the chunk that marks an animated PNG
+
+
+def test_no_frames_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="at least one frame"):
+        save_animation([], tmp_path / "nothing.gif")

@@ -1,0 +1,44 @@
+import numpy as np
+import pytest
+
+from dqn_keras import Config, action, decay_epsilon
+
+
+class Tape:
+    """A generator that gives what it is told, and writes down what it was asked."""
+
+    def __init__(self, uniform, integer):
+        self.uniform, self.integer, self.calls = uniform, integer, []
+
+    def random(self):
+        self.calls.append("random()")
+        return self.uniform
+
+    def integers(self, n):
+        self.calls.append(f"integers({n})")
+        return np.int64(self.integer)
+
+
+@pytest.mark.parametrize("q", [np.array([1.0, 5.0, 2.0]), np.array([[1.0, 5.0, 2.0]])])
+def test_explores_below_epsilon_and_is_greedy_from_it_on(q):
+    explore, greedy = Tape(0.29, 2), Tape(0.3, 2)
+    assert action(q, 0.3, explore) == 2
+    assert explore.calls == ["random()", "integers(3)"]
+    assert action(q, 0.3, greedy) == 1
+    assert greedy.calls == ["random()"]
+
+
+def test_of_equal_values_the_first_is_taken(rng):
+    assert action(np.zeros(3), 0.0, rng) == 0
+
+
+def test_epsilon_one_is_uniform(rng):
+    counts = np.bincount([action(np.array([9.0, 0, 0, 0]), 1.0, rng) for _ in range(4000)])
+    assert abs(counts - 1000).max() < 5 * np.sqrt(4000 * 0.25 * 0.75)  # five standard deviations
+
+
+def test_epsilon_falls_by_its_factor_and_stops_at_its_floor():
+    config = Config()
+    assert decay_epsilon(1.0, config) == 0.995
+    assert decay_epsilon(0.1001, config) == 0.1
+    assert decay_epsilon(0.1, config) == 0.1

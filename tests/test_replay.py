@@ -1,0 +1,76 @@
+from collections import deque
+
+import numpy as np
+import tensorflow as tf
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from scipy import stats
+
+from dqn_keras import Experience, ReplayMemory
+from dqn_keras.replay import unpack
+
+
+class MemoryAgainstDeque(RuleBasedStateMachine):
+    """Whatever is appended and drawn, the ring holds what a bounded deque holds, in its order."""
+
+    @initialize(size=st.integers(1, 12), features=st.integers(1, 3), seed=st.integers(0, 99))
+    def start(self, size, features, seed):
+        self.memory, self.model = ReplayMemory(size, features), deque(maxlen=size)
+        self.features, self.numbers = features, np.random.default_rng(seed)
+
+    @rule()
+    def append(self):
+        state, next_state = self.numbers.normal(size=(2, self.features)).astype(np.float32)
+        transition = Experience(state, 3, np.float32(self.numbers.normal()), next_state, bool(self.numbers.integers(2)))
+        self.memory.append(transition)
+        self.model.append(transition._replace(state=state.copy()))
+        state += 1  # the memory must have kept the value, not the array
+
+    @rule(seed=st.integers(0, 99), data=st.data())
+    def sample(self, seed, data):
+        if self.model:
+            batch_size = data.draw(st.integers(1, len(self.model)))
+            batch = self.memory.sample(batch_size, np.random.default_rng(seed))
+            chosen = np.random.default_rng(seed).choice(len(self.model), batch_size, replace=False)
+            assert len(set(chosen)) == batch_size
+            for values, name in zip(batch, Experience._fields, strict=True):
+                np.testing.assert_array_equal(values, np.array([getattr(self.model[i], name) for i in chosen]))
+
+    @invariant()
+    def same_length(self):
+        assert not hasattr(self, "memory") or len(self.memory) == len(self.model)
+
+
+MemoryAgainstDeque.TestCase.settings = settings(max_examples=100, stateful_step_count=40, deadline=None)
+TestMemoryAgainstDeque = MemoryAgainstDeque.TestCase
+
+
+def filled(size, count):
+    memory = ReplayMemory(size, 1)
+    for i in range(count):
+        memory.append(Experience([i], i % 2, i, [i + 1], 0))
+    return memory
+
+
+def test_a_batch_has_no_repeats_and_is_uniform(rng):
+    memory, counts = filled(100, 150), np.zeros(150)
+    for _ in range(2000):
+        drawn = memory.sample(10, rng).reward.astype(int)
+        assert len(set(drawn)) == 10
+        counts[drawn] += 1
+    assert not counts[:50].any()  # forgotten
+    assert stats.chisquare(counts[50:]).pvalue > 1e-4
+
+
+def test_a_batch_has_the_dtypes_that_learn_wants(rng):
+    batch = filled(8, 8).sample(4, rng)
+    assert [x.dtype for x in batch] == [np.float32, np.int32, np.float32, np.float32, np.float32]
+    assert [x.shape for x in batch] == [(4, 1), (4,), (4,), (4, 1), (4,)]
+
+
+def test_rows_unpack_alike_in_numpy_and_tensorflow():
+    rows = filled(8, 8).rows
+    for array, tensor in zip(unpack(rows, 1), unpack(tf.constant(rows), 1), strict=True):
+        np.testing.assert_array_equal(array, tensor.numpy())
+        assert array.dtype == tensor.numpy().dtype

@@ -1,0 +1,181 @@
+import csv
+import hashlib
+import os
+import subprocess
+import sys
+
+import gymnasium as gym
+import keras
+import numpy as np
+import pytest
+
+from dqn_keras import Config, train
+from tests.environments import Corridor
+
+QUICK = Config(num_episodes=30, batch_size=16, solved_reward=1000)
+
+
+def fingerprint(run):
+    arrays = [*run.q_network.get_weights(), *run.q_hat_network.get_weights()]
+    arrays += [v.numpy() for v in run.agent.optimizer.variables]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in [*arrays, run.rewards])).hexdigest()
+
+
+def test_cartpole_is_solved_in_the_originals_way(cartpole, capsys):
+    # One seed is enough to see every line printed; how often it succeeds is measured over many (results/).
+    run = train(cartpole, Config(), seed=0)
+    lines = capsys.readouterr().out.splitlines()
+    assert run.solved_at is not None
+    assert len(run.rewards) == run.solved_at + 1
+    means = np.convolve(run.rewards, np.full(50, 1 / 50), mode="valid")
+    assert means[-1] > 225
+    assert (means[:-1] <= 225).all()
+    averages = {k: round(run.rewards[max(0, k - 99) : k + 1].mean(), 2) for k in range(0, run.solved_at + 1, 100)}
+    expected = [f"Episode {k}, Reward: {run.rewards[k]}, Last 100 Average: {x}" for k, x in averages.items()]
+    assert lines == [*expected, f"Solved with {round(means[-1], 2)} reward in {run.solved_at} episodes!"]
+    assert repr(run) == f"<Run: seed=0, {len(run.rewards)} episodes, solved_at={run.solved_at}>"
+
+
+def test_fewer_episodes_than_the_window_never_count_as_solved():
+    config = Config(num_episodes=60, batch_size=8, solved_reward=3.5, solved_window=50)
+    run = train(Corridor(length=100, limit=4), config, seed=0, verbose=0)
+    assert run.solved_at == 49
+
+
+def test_the_stop_rule_wants_more_not_as_much():
+    config = Config(num_episodes=60, batch_size=8, solved_reward=4.0, solved_window=50)
+    assert train(Corridor(length=100, limit=4), config, seed=0, verbose=0).solved_at is None
+
+
+SCRIPT = """
+import gymnasium as gym
+from dqn_keras import train
+from tests.test_training import QUICK, fingerprint
+print(fingerprint(train(gym.make("CartPole-v1"), QUICK, seed={seed}, verbose=0)))
+"""
+
+
+def test_one_seed_gives_the_same_bits_in_another_process_and_another_seed_does_not(cartpole):
+    here = fingerprint(train(cartpole, QUICK, seed=5, verbose=0))
+    for seed, hash_seed, same in [(5, "1", True), (6, "0", False)]:
+        environment = {**os.environ, "PYTHONHASHSEED": hash_seed}
+        there = subprocess.run(
+            [sys.executable, "-c", SCRIPT.format(seed=seed)],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+        assert (there == here) is same
+
+
+def test_no_seed_is_a_fresh_one_that_can_be_used_again(cartpole):
+    first, second = (train(cartpole, QUICK, verbose=0) for _ in range(2))
+    assert first.seed != second.seed
+    assert fingerprint(train(cartpole, QUICK, seed=first.seed, verbose=0)) == fingerprint(first)
+
+
+def test_the_global_random_state_is_neither_read_nor_set(cartpole):
+    prints = []
+    for seed in (1, 2):
+        keras.utils.set_random_seed(seed)
+        before = np.random.get_state()[1].copy()  # noqa: NPY002
+        prints.append(fingerprint(train(cartpole, QUICK, seed=0, verbose=0)))
+        np.testing.assert_array_equal(before, np.random.get_state()[1])  # noqa: NPY002
+    assert prints[0] == prints[1]
+
+
+def test_verbose_zero_prints_nothing(cartpole, capfd):
+    train(cartpole, QUICK, seed=0, verbose=0)
+    assert capfd.readouterr().out == ""
+
+
+class Tape(keras.callbacks.Callback):
+    def __init__(self, stop_after=None):
+        super().__init__()
+        self.stop_after, self.calls = stop_after, []
+
+    def on_train_begin(self, logs=None):
+        self.calls.append("train begins")
+
+    def on_epoch_begin(self, epoch, logs=None):
+        self.calls.append(("begins", epoch))
+
+    def on_epoch_end(self, epoch, logs=None):
+        self.calls.append(("ends", epoch))
+        self.logs = logs
+        self.model.stop_training = epoch == self.stop_after
+
+    def on_train_end(self, logs=None):
+        self.calls.append("train ends")
+
+
+def test_an_episode_is_an_epoch_to_keras_callbacks(cartpole):
+    tape = Tape(stop_after=1)
+    run = train(cartpole, QUICK, seed=0, verbose=0, callbacks=[tape])
+    assert tape.calls == ["train begins", *[(w, k) for k in (0, 1) for w in ("begins", "ends")], "train ends"]
+    assert tape.logs["reward"] == run.rewards[-1]
+    assert len(run.episodes) == 2
+
+
+def test_callbacks_hear_every_end_also_when_the_run_is_solved():
+    tape = Tape()
+    config = Config(num_episodes=60, batch_size=8, solved_reward=3.5)
+    train(Corridor(length=100, limit=4), config, seed=0, verbose=0, callbacks=[tape])
+    assert tape.calls[-2:] == [("ends", 49), "train ends"]
+
+
+def test_keras_own_callbacks_work(cartpole, tmp_path):
+    log, model = tmp_path / "log.csv", tmp_path / "best.keras"
+    schedule = keras.callbacks.LearningRateScheduler(lambda episode: 0.001 * 0.9**episode)
+    run = train(
+        cartpole,
+        QUICK,
+        seed=0,
+        verbose=0,
+        callbacks=[
+            keras.callbacks.CSVLogger(log),
+            keras.callbacks.ModelCheckpoint(model, monitor="reward", mode="max", save_best_only=True),
+            schedule,
+        ],
+    )
+    rows = list(csv.DictReader(log.open()))
+    assert [float(row["reward"]) for row in rows] == run.rewards.tolist()
+    assert keras.saving.load_model(model).optimizer is not None
+    assert run.agent.optimizer.learning_rate.numpy() == pytest.approx(0.001 * 0.9**29)
+
+
+class Zeroed(keras.callbacks.Callback):
+    """Makes the network prefer action 1 before each episode."""
+
+    def on_epoch_begin(self, epoch, logs=None):
+        self.model.set_weights([np.zeros_like(w) for w in self.model.get_weights()[:-1]] + [np.array([0.0, 1.0])])
+
+
+def test_the_loop_acts_with_the_weights_that_a_callback_set():
+    env = Corridor(length=3)
+    config = Config(num_episodes=20, epsilon=0.0, epsilon_min=0.0, batch_size=64)
+    with pytest.warns(UserWarning, match="without an update: the memory holds 60 transitions, batch_size is 64"):
+        train(env, config, verbose=0, callbacks=[Zeroed()], seed=0)
+    assert env.actions == [1] * 60
+
+
+def test_bad_arguments_are_refused_before_any_work(cartpole):
+    with pytest.raises(TypeError, match=r"^config must be a Config"):
+        train(cartpole, {"gamma": 0.9})
+    for seed in (-1, 1.5, "0", True, np.nan):
+        with pytest.raises((TypeError, ValueError), match=r"^seed must be a whole number"):
+            train(cartpole, seed=seed)
+    with pytest.raises(ValueError, match=r"^verbose must be 0 or 1, got 2"):
+        train(cartpole, verbose=2)
+
+
+def test_numpy_seeds_are_taken(cartpole):
+    assert train(cartpole, Config(num_episodes=4, batch_size=8), seed=np.int64(3), verbose=0).seed == 3
+
+
+@pytest.mark.parametrize("name", ["Acrobot-v1", "MountainCar-v0"])
+def test_other_environments_train(name):
+    run = train(gym.make(name), Config(num_episodes=2), seed=0, verbose=0)
+    assert run.agent.num_updates > 50
+    assert np.isfinite(run.rewards).all()
