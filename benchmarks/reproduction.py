@@ -54,6 +54,7 @@ def report(outcomes: list[Outcome]) -> str:
     episodes, n = np.array([o.solved_at for o in solved]), len(outcomes)
     usual = episodes[episodes < 500]
     versions = ", ".join(f"{p} {importlib.metadata.version(p)}" for p in ("tensorflow", "keras", "gymnasium", "numpy"))
+    low, median, high = np.quantile([o.greedy for o in solved], (0.25, 0.5, 0.75))
     not_worse = sum(o.greedy >= o.training for o in solved)
     lines = [
         "# The original's claim, over many seeds",
@@ -69,9 +70,8 @@ def report(outcomes: list[Outcome]) -> str:
         f"| median episodes to solved, all seeds | {np.median([o.solved_at or 2000 for o in outcomes]):.1f} |",
         f"| median env steps of a run | {np.median([o.env_steps for o in outcomes]):,.0f} |",
         f"| mean return of 100 greedy episodes after solved runs, median over seeds (quartiles) | "
-        f"{np.median([o.greedy for o in solved]):.0f} "
-        f"({np.quantile([o.greedy for o in solved], 0.25):.0f} to {np.quantile([o.greedy for o in solved], 0.75):.0f}) |",
-        f"| greedy play at least as good as the last 50 training episodes | {not_worse} of {len(solved)} solved seeds |",
+        f"{median:.0f} ({low:.0f} to {high:.0f}) |",
+        f"| greedy play at least as good as the last 50 training episodes | {not_worse} of {len(solved)} solved runs |",
         "",
         "Each seed: episode at which it was solved (- if not), mean reward of the last 50 training episodes, mean "
         "return of 100 greedy episodes.",
