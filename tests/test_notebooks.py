@@ -42,3 +42,16 @@ def test_the_main_notebook_shows_a_solved_run_and_a_moving_pole():
     assert any("Solved with" in output.get("text", "") for output in outputs)
     saved = (NOTEBOOKS.parent / "results" / "pole.png").read_bytes()
     assert b"acTL" in saved[:200]  # the chunk that marks an animated PNG
+
+
+def test_a_cell_that_is_run_twice_does_no_harm(capsys, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    cells = [cell.source for cell in rendered(NOTEBOOKS / "deep_q_network.py").cells if cell.cell_type == "code"]
+    namespace, lines = {}, []
+    for cell in cells:
+        for _ in range(2):
+            exec(compile(cell, "notebook", "exec"), namespace)
+        lines += [line for line in capsys.readouterr().out.splitlines() if line.startswith("Solved")]
+    assert len(lines) == 4
+    assert lines[0] == lines[1]
+    assert lines[2] == lines[3]
