@@ -26,11 +26,25 @@ def _native_stderr_silenced() -> Iterator[None]:
 def require_tensorflow_backend() -> None:
     """Import TensorFlow and Keras quietly; ImportError if Keras was told to run on something else."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # errors still show
+    advice = "unset KERAS_BACKEND, or set it to 'tensorflow' before Keras is imported"
+    if os.environ.get("KERAS_BACKEND", "tensorflow") != "tensorflow":
+        raise ImportError(f"dqn_keras needs Keras on TensorFlow, not on {os.environ['KERAS_BACKEND']!r}: {advice}")
     with _native_stderr_silenced():
         import keras
         import tensorflow  # noqa: F401
     if keras.backend.backend() != "tensorflow":
-        raise ImportError(
-            f"dqn_keras needs Keras on TensorFlow, but Keras runs on {keras.backend.backend()!r}; "
-            "unset KERAS_BACKEND or set it to 'tensorflow' before Keras is imported"
-        )
+        raise ImportError(f"dqn_keras needs Keras on TensorFlow, not on {keras.backend.backend()!r}: {advice}")
+
+
+@contextlib.contextmanager
+def explain_missing_xla() -> Iterator[None]:
+    """Say in one line what to do where TensorFlow was built without XLA's compiler for this machine."""
+    import tensorflow as tf
+
+    try:
+        yield
+    except (tf.errors.NotFoundError, tf.errors.UnimplementedError) as error:
+        raise RuntimeError(
+            "XLA cannot compile on this machine; Config(jit_compile=False), or learn(..., jit_compile=False), does "
+            f"without it in the Gymnasium loop ({error.message.splitlines()[0]})"
+        ) from error

@@ -8,6 +8,7 @@ import numpy as np
 
 from dqn_keras.config import Config, count
 from dqn_keras.networks import make_networks
+from dqn_keras.programs import Learner
 from dqn_keras.replay import ReplayMemory
 
 
@@ -24,10 +25,15 @@ class Agent:
     """The source of every random draw of acting and sampling."""
     epsilon: float
     """Probability of a random action in the next episode."""
-    num_episodes: int = 0
-    """Episodes played: the number of the next one."""
+    episodes: list["Episode"] = dataclasses.field(default_factory=list)
+    """The record so far; its length is the number of the next episode."""
     num_updates: int = 0
     """Gradient steps taken."""
+
+    @property
+    def learner(self) -> Learner:
+        """What a gradient step changes."""
+        return Learner(self.q_network, self.q_hat_network, self.optimizer)
 
 
 class Episode(NamedTuple):
@@ -62,8 +68,18 @@ def make_agent(num_features: int, num_actions: int, config: Config, seed: int) -
 
 
 def episode_seed(seed: int, episode: int) -> int:
-    """The seed of `env.reset` for one episode of a run: any episode can be begun again exactly."""
+    """The seed of `env.reset` for one episode of a run, so that any episode can be begun again exactly."""
     return int(_derived(seed, 2, episode).generate_state(1)[0])
+
+
+def evaluation_seed(seed: int, episode: int) -> int:
+    """The same for an episode of `evaluate`, which so starts where no episode of `train` did."""
+    return int(_derived(seed, 3, episode).generate_state(1)[0])
+
+
+def draws_key(seed: int) -> np.int64:
+    """The number that all draws of a compiled run follow from."""
+    return _derived(seed, 4).generate_state(1, np.uint64).view(np.int64)[0]
 
 
 def checked_seed(seed: int | None) -> int:
@@ -74,5 +90,5 @@ def checked_seed(seed: int | None) -> int:
 
 
 def _derived(seed: int, *key: int) -> np.random.SeedSequence:
-    """One of the independent streams that belong to `seed`: 0 weights, 1 draws, (2, k) the start of episode k."""
+    """One of the independent streams that belong to `seed`."""
     return np.random.SeedSequence(seed, spawn_key=key)

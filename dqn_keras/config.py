@@ -58,7 +58,7 @@ class Config:
         self._set("decay", number("decay", self.decay, above=0, at_most=1))
         self._set("epsilon_min", number("epsilon_min", self.epsilon_min, at_least=0, at_most=self.epsilon))
         self._set("solved_reward", number("solved_reward", self.solved_reward))
-        self._set("hidden_units", _counts("hidden_units", self.hidden_units))
+        self._set("hidden_units", counts("hidden_units", self.hidden_units))
         if not isinstance(self.jit_compile, bool | np.bool_):
             raise TypeError(f"jit_compile must be True or False, got {self.jit_compile!r}")
         self._set("jit_compile", bool(self.jit_compile))
@@ -112,10 +112,11 @@ def number(
     return converted
 
 
-def _counts(name: str, values: Any) -> tuple[int, ...]:
+def counts(name: str, values: Any) -> tuple[int, ...]:
+    """A sequence of whole numbers above 0 as a tuple of ints, or an error that names it."""
     if isinstance(values, np.ndarray) and values.ndim == 1:
         values = list(values)
-    if isinstance(values, str) or not isinstance(values, Sequence):
+    if isinstance(values, str | bytes) or not isinstance(values, Sequence):
         raise TypeError(f"{name} must be a tuple of whole numbers, one per hidden layer, got {values!r}")
     if not values:
         raise ValueError(f"{name} must name at least one hidden layer, got {values!r}")

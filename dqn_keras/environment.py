@@ -1,12 +1,10 @@
 """The door between a gymnasium.Env and the rest: what comes through it is of the right kind, and finite."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
-
-from dqn_keras.agent import episode_seed
 
 
 class CheckedEnv:
@@ -20,24 +18,14 @@ class CheckedEnv:
         if not isinstance(env, gym.Env):
             raise TypeError(f"env must be a gymnasium.Env, got {env!r}")
         self.name = env.spec.id if env.spec else type(env.unwrapped).__name__
-        observations, actions = env.observation_space, env.action_space
-        if not isinstance(observations, gym.spaces.Box) or len(observations.shape) != 1 or not observations.shape[0]:
-            raise ValueError(
-                f"env {self.name} has the observation space {observations}; supported is a Box of one axis "
-                "(gymnasium.wrappers.FlattenObservation makes one of most spaces)"
-            )
-        if not isinstance(actions, gym.spaces.Discrete):
-            raise ValueError(f"env {self.name} has the action space {actions}; supported is Discrete")
+        self.spaces = check_spaces(self.name, env.observation_space, env.action_space)
         self._env = env
-        self._shape = observations.shape
-        self._first_action = int(actions.start)
-        self.num_features = observations.shape[0]
-        self.num_actions = int(actions.n)
+        self._shape = (self.spaces.num_features,)
 
     def reset(self, seed: int, episode: int) -> np.ndarray:
-        """Begin an episode, with the environment seeded from (seed, episode): its first state."""
+        """Begin an episode with the environment seeded: its first state. The number is for messages."""
         self._episode, self._step = episode, -1
-        result = self._env.reset(seed=episode_seed(seed, episode))
+        result = self._env.reset(seed=seed)
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._error("reset() must return (observation, info)", result)
         return self._checked_state(result[0])
@@ -45,18 +33,19 @@ class CheckedEnv:
     def step(self, a: int) -> tuple[np.ndarray, float, bool, bool]:
         """Next state, reward, terminated, truncated after the action of index `a`."""
         self._step += 1
-        result = self._env.step(self._first_action + a)
+        result = self._env.step(self.spaces.first_action + a)
         try:
             observation, reward, terminated, truncated, _ = result
         except (TypeError, ValueError):
             wanted = "step() must return (observation, reward, terminated, truncated, info)"
             raise self._error(wanted, result) from None
-        try:
-            reward = float(reward)
-        except (TypeError, ValueError):
-            raise self._error("the reward must be a number", reward) from None
+        if not isinstance(reward, SupportsFloat):
+            raise self._error("the reward must be a number", reward)
+        reward = float(reward)
         if not abs(reward) <= _LARGEST:
             raise self._error("the reward must be finite in float32", reward)
+        if not isinstance(terminated, _BOOLS) or not isinstance(truncated, _BOOLS):
+            raise self._error("terminated and truncated must be booleans", (terminated, truncated))
         return self._checked_state(observation), reward, bool(terminated), bool(truncated)
 
     def _checked_state(self, observation: Any) -> np.ndarray:
@@ -75,4 +64,26 @@ class CheckedEnv:
         return ValueError(f"env {self.name}: {wanted}, got {got!r} in episode {self._episode}, {where}")
 
 
+class Spaces(NamedTuple):
+    """What a network must know of an environment."""
+
+    num_features: int
+    num_actions: int
+    first_action: int
+    """What the environment calls the action of index 0."""
+
+
+def check_spaces(name: str, observations: gym.Space, actions: gym.Space) -> Spaces:
+    """The sizes of the two spaces; ValueError if they are not supported."""
+    if not isinstance(observations, gym.spaces.Box) or len(observations.shape) != 1 or not observations.shape[0]:
+        raise ValueError(
+            f"env {name} has the observation space {observations}; supported is a Box of one axis "
+            "(gymnasium.wrappers.FlattenObservation makes one of most spaces)"
+        )
+    if not isinstance(actions, gym.spaces.Discrete):
+        raise ValueError(f"env {name} has the action space {actions}; supported is Discrete")
+    return Spaces(observations.shape[0], int(actions.n), int(actions.start))
+
+
+_BOOLS = (bool, np.bool_)
 _LARGEST = float(np.finfo(np.float32).max)

@@ -4,7 +4,7 @@ import gymnasium as gym
 import keras
 import numpy as np
 
-from dqn_keras.agent import checked_seed
+from dqn_keras.agent import checked_seed, evaluation_seed
 from dqn_keras.config import count
 from dqn_keras.environment import CheckedEnv
 from dqn_keras.networks import check_fits, q_function
@@ -19,14 +19,14 @@ def evaluate(
         env: as for `train`.
         q_network: states [B, F] -> Q-values [B, A].
         num_episodes: how many.
-        seed: episode k starts from a state that follows from (seed, k); None draws a seed.
+        seed: episode k starts from a state that follows from (seed, k), and from no start of `train`; None draws one.
         max_steps: steps after which an episode is left, if the environment has not ended it.
 
     Raises:
         TypeError, ValueError: as for `train`; or the network does not fit the environment.
     """
     checked_env = CheckedEnv(env)
-    check_fits(q_network, checked_env.num_features, checked_env.num_actions)
+    check_fits(q_network, checked_env.spaces.num_features, checked_env.spaces.num_actions)
     num_episodes, max_steps, seed = (
         count("num_episodes", num_episodes),
         count("max_steps", max_steps),
@@ -35,7 +35,7 @@ def evaluate(
     q_values = q_function(q_network)
     returns = np.zeros(num_episodes)
     for episode in range(num_episodes):
-        state = checked_env.reset(seed, episode)
+        state = checked_env.reset(evaluation_seed(seed, episode), episode)
         for _ in range(max_steps):
             state, reward, terminated, truncated = checked_env.step(int(q_values(state).argmax()))
             returns[episode] += reward

@@ -5,13 +5,15 @@ that of Lillicrap et al., "Continuous control with deep reinforcement learning" 
 """
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import keras
 import tensorflow as tf
 
-from dqn_keras.replay import Experience, as_batch, check_values
+from dqn_keras.networks import check_network
+from dqn_keras.programs import Learner, bind
+from dqn_keras.replay import as_batch, as_share
 
 
 def loss_values(
@@ -29,9 +31,13 @@ def loss_values(
         q_hat_network: the same for the targets.
 
     Raises:
-        ValueError: a field's shape or dtype is wrong; the message names the field.
+        TypeError, ValueError: a field's shape, dtype or value is wrong; the message names the field.
     """
-    states, actions, rewards, next_states, terminal_states = as_batch(experiences, q_network.input_shape[1:])
+    check_network("q_network", q_network)
+    check_network("q_hat_network", q_hat_network)
+    batch = as_batch(experiences, q_network.input_shape[1:], q_network.output_shape[-1])
+    states, actions, rewards, next_states, terminal_states = batch
+    gamma = as_share("gamma", gamma)
     max_q_hat = tf.reduce_max(q_hat_network(next_states), axis=-1)  # [B]
     targets = rewards + (1 - terminal_states) * gamma * max_q_hat  # [B]
     q_of_actions = tf.gather(q_network(states), actions, batch_dims=1)  # [B]
@@ -40,7 +46,7 @@ def loss_values(
 
 def update_q_hat(q_network: keras.Model, q_hat_network: keras.Model, tau: Any = 0.01) -> None:
     """Move Q-hat's weights a little towards Q's: theta_hat <- tau theta + (1 - tau) theta_hat."""
-    tau = tf.convert_to_tensor(tau, tf.float32)
+    tau = as_share("tau", tau)
     for q_weights, q_hat_weights in zip(q_network.weights, q_hat_network.weights, strict=True):
         q_hat_weights.assign(tau * q_weights + (1 - tau) * q_hat_weights)
 
@@ -74,8 +80,8 @@ def learn(
 ) -> tf.Tensor:
     """Learn from one batch: a gradient step on Q and a soft update of Q-hat, compiled into one call.
 
-    It is compiled at the first call for these two networks and this optimizer, and never again. All three are
-    changed in place; any number of agents can live side by side, and what was compiled goes when they go.
+    It is traced once for all agents whose networks and optimizer are configured alike, and compiled once for each
+    size of the batch. The three are changed in place; any number of agents can live side by side.
 
     Args:
         experiences: as for `loss_values`: an Experience, or any five arrays in its order.
@@ -90,43 +96,48 @@ def learn(
         The loss of the batch before the step, a scalar float32 tensor.
 
     Raises:
-        ValueError: a wrong shape or dtype, an action that is not one, networks that do not match.
+        TypeError, ValueError: a wrong shape or dtype, an action that is not one, a number that is not finite,
+            networks that do not match; nothing is changed then.
     """
-    step = _compiled_step(q_network, q_hat_network, optimizer, jit_compile)
-    batch = as_batch(experiences, q_network.input_shape[1:])
-    check_values(batch, q_network.output_shape[-1])
-    return step(batch, tf.convert_to_tensor(gamma, tf.float32), tf.convert_to_tensor(tau, tf.float32))
+    check_network("q_network", q_network)
+    check_network("q_hat_network", q_hat_network)
+    learner = Learner(q_network, q_hat_network, optimizer)
+    if not tf.executing_eagerly():  # in a tf.function of the caller's, which then compiles it
+        with tf.init_scope():
+            _prepare(learner)
+        return gradient_step(experiences, gamma, *learner, tau)
+    step = _bound_step(learner, jit_compile)
+    batch = as_batch(experiences, q_network.input_shape[1:], q_network.output_shape[-1])
+    gamma, tau = as_share("gamma", gamma), as_share("tau", tau)
+    return step(*batch, gamma, tau)[0]
 
 
-_compiled_steps: dict[tuple[int, int, int, bool], Callable[..., tf.Tensor]] = {}
+_bound_steps: dict[Hashable, Callable] = {}
 
 
-def _compiled_step(
-    q_network: keras.Model, q_hat_network: keras.Model, optimizer: keras.Optimizer, jit_compile: bool
-) -> Callable[..., tf.Tensor]:
-    """`gradient_step` for these three, compiled once; forgotten when one of them is garbage."""
-    key = (id(q_network), id(q_hat_network), id(optimizer), jit_compile)
-    if key not in _compiled_steps:
-        prepare(q_network, q_hat_network, optimizer)
-        # what is compiled must not keep the agent alive, so it holds the three by weak references
-        q, q_hat, adam = weakref.ref(q_network), weakref.ref(q_hat_network), weakref.ref(optimizer)
-
-        def step(batch: Experience, gamma: tf.Tensor, tau: tf.Tensor) -> tf.Tensor:
-            return gradient_step(batch, gamma, q(), q_hat(), adam(), tau)
-
-        state, scalar = tf.TensorSpec((None, *q_network.input_shape[1:])), tf.TensorSpec(())
-        vector, indices = tf.TensorSpec((None,)), tf.TensorSpec((None,), tf.int32)
-        signature = (Experience(state, indices, vector, state, vector), scalar, scalar)  # a batch of any size
-        _compiled_steps[key] = tf.function(step, signature, jit_compile=jit_compile, autograph=False)
-        for owner in (q_network, q_hat_network, optimizer):
-            weakref.finalize(owner, _compiled_steps.pop, key, None).atexit = False
-    return _compiled_steps[key]
+def _bound_step(learner: Learner, jit_compile: bool) -> Callable[..., list[tf.Tensor]]:
+    """The compiled `gradient_step` for these three; found at once from the second call on."""
+    key = (*map(id, learner), jit_compile, *map(id, learner.q_network.trainable_variables))
+    if key not in _bound_steps:
+        _prepare(learner)
+        state = tf.TensorSpec((None, *learner.q_network.input_shape[1:]))  # a batch of any size
+        scalar, vector, indices = tf.TensorSpec(()), tf.TensorSpec((None,)), tf.TensorSpec((None,), tf.int32)
+        specs = (state, indices, vector, state, vector, scalar, scalar)
+        _bound_steps[key] = bind("learn", _make_step, specs, learner, jit_compile=jit_compile)
+        for owner in learner:  # what is bound holds the agent's variables: it must go when the agent goes
+            weakref.finalize(owner, _bound_steps.pop, key, None).atexit = False
+    return _bound_steps[key]
 
 
-def prepare(q_network: keras.Model, q_hat_network: keras.Model, optimizer: keras.Optimizer) -> None:
-    """Check that the networks belong together, and build the optimizer: a tf.function may not create variables."""
-    if not (q_network.built and q_hat_network.built):
-        raise ValueError("q_network and q_hat_network must have weights: give them an Input layer, or call build()")
+def _make_step(learner: Learner, _: Any) -> Callable[..., tf.Tensor]:
+    return lambda *tensors: gradient_step(tensors[:5], tensors[5], *learner, tau=tensors[6])
+
+
+def _prepare(learner: Learner) -> None:
+    """Check that the networks belong together, and build the optimizer."""
+    q_network, q_hat_network, optimizer = learner
+    if not isinstance(optimizer, keras.Optimizer):
+        raise TypeError(f"optimizer must be a Keras optimizer, got {optimizer!r}")
     if q_network is q_hat_network:
         raise ValueError("q_hat_network must be a second network, got q_network itself")
     shapes, hat_shapes = ([tuple(w.shape) for w in n.weights] for n in (q_network, q_hat_network))
@@ -134,3 +145,4 @@ def prepare(q_network: keras.Model, q_hat_network: keras.Model, optimizer: keras
         raise ValueError(f"q_hat_network must have weights of q_network's shapes {shapes}, got {hat_shapes}")
     if not optimizer.built:
         optimizer.build(q_network.trainable_variables)
+    optimizer._check_variables_are_known(q_network.trainable_variables)  # else ValueError, in Keras' words

@@ -9,6 +9,8 @@ from keras import Sequential
 from keras.initializers import GlorotUniform
 from keras.layers import Dense, Input
 
+from dqn_keras.config import count, counts
+
 
 def make_q_network(
     num_features: int,
@@ -22,13 +24,16 @@ def make_q_network(
     Hidden layers are ReLU, the output is linear. Kernels start Glorot uniform (Keras' default), drawn
     from `seed` without touching any global random state; biases start at zero.
     """
+    num_features, num_actions = count("num_features", num_features), count("num_actions", num_actions)
+    hidden_units = counts("hidden_units", hidden_units)
     seeds = np.random.default_rng(seed).integers(2**31, size=len(hidden_units) + 1)
     *hidden, output = [GlorotUniform(seed=int(s)) for s in seeds]
-    layers: list[keras.Layer] = [Input(shape=(int(num_features),))]
+    layers: list[keras.Layer] = [Input(shape=(num_features,), dtype="float32")]
     for i, (units, initializer) in enumerate(zip(hidden_units, hidden, strict=True), start=1):
-        layers.append(Dense(int(units), activation="relu", kernel_initializer=initializer, name=f"hidden_{i}"))
-    # Gymnasium counts actions in np.int64, which Keras refuses
-    layers.append(Dense(int(num_actions), activation="linear", kernel_initializer=output, name="q_values"))
+        layers.append(
+            Dense(units, activation="relu", kernel_initializer=initializer, dtype="float32", name=f"hidden_{i}")
+        )
+    layers.append(Dense(num_actions, activation="linear", kernel_initializer=output, dtype="float32", name="q_values"))
     return Sequential(layers, name=name)
 
 
@@ -77,14 +82,25 @@ def q_function(q_network: keras.Model) -> Callable[[np.ndarray], np.ndarray]:
 
 def is_relu_mlp(q_network: keras.Model) -> bool:
     """Whether `q_values` computes this network: dense layers, ReLU but for a linear last one."""
-    if not isinstance(q_network, Sequential) or not all(type(x) is Dense and x.use_bias for x in q_network.layers):
+    if not isinstance(q_network, Sequential):
+        return False
+    if not all(type(x) is Dense and len(x.weights) == 2 and x.compute_dtype == "float32" for x in q_network.layers):
         return False
     *hidden, output = [layer.activation for layer in q_network.layers]
     return all(x is keras.activations.relu for x in hidden) and output is keras.activations.linear
 
 
+def check_network(name: str, network: keras.Model) -> None:
+    """TypeError or ValueError if it is not a Sequential or functional model that has been built."""
+    if not isinstance(network, Sequential | keras.models.Model):
+        raise TypeError(f"{name} must be a Keras model, got {network!r}")
+    if not network.built or not hasattr(network, "input_shape"):
+        raise ValueError(f"{name} must be a Sequential or functional model with an Input layer")
+
+
 def check_fits(q_network: keras.Model, num_features: int, num_actions: int) -> None:
     """ValueError if the network does not take this environment's states or give its actions' values."""
+    check_network("q_network", q_network)
     shapes = (q_network.input_shape[1:], q_network.output_shape[1:])
     if shapes != ((num_features,), (num_actions,)):
         raise ValueError(

@@ -10,7 +10,7 @@ import keras
 import numpy as np
 from PIL import Image
 
-from dqn_keras.agent import checked_seed
+from dqn_keras.agent import checked_seed, evaluation_seed
 from dqn_keras.config import count
 from dqn_keras.environment import CheckedEnv
 from dqn_keras.networks import check_fits, q_function
@@ -28,11 +28,11 @@ def record_episode(
     `render_mode="rgb_array"`, which needs no display; ValueError otherwise.
     """
     checked_env = CheckedEnv(env)
-    check_fits(q_network, checked_env.num_features, checked_env.num_actions)
+    check_fits(q_network, checked_env.spaces.num_features, checked_env.spaces.num_actions)
     if env.render_mode != "rgb_array":
         raise ValueError(f'env must be made with render_mode="rgb_array", got {env.render_mode!r}')
     q_values = q_function(q_network)
-    state = checked_env.reset(checked_seed(seed), episode=0)
+    state = checked_env.reset(evaluation_seed(checked_seed(seed), 0), episode=0)
     frames = [np.asarray(env.render())]
     for _ in range(count("max_steps", max_steps)):
         state, _, terminated, truncated = checked_env.step(int(q_values(state).argmax()))
@@ -60,18 +60,27 @@ def save_animation(
     """
     if not len(frames):
         raise ValueError("frames must hold at least one frame, got none")
+    fps, width = count("fps", fps), count("width", width)
+    for frame in frames:
+        if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+            raise ValueError(f"frames must be [H, W, 3] uint8, got {frame.shape} {frame.dtype}")
     height, full_width = frames[0].shape[:2]
     size = (width, round(height * width / full_width))
     images = [Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS) for frame in frames[::2]]
-    palette = images[0].quantize(colors=32)  # one palette for all, so that frames differ only where things move
+    # One palette for all, from eight of them, so that frames differ only where things move.
+    palette = Image.fromarray(np.concatenate([np.asarray(x) for x in images[:: max(1, len(images) // 8)]])).quantize(
+        colors=32
+    )
     first, *rest = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     first.save(file, format=format, save_all=True, append_images=rest, duration=round(2000 / fps), loop=0)
 
 
 def animate(frames: Sequence[np.ndarray], fps: int = 50, width: int = 300) -> "IPython.display.Image":
     """The moving picture as a notebook shows it: an animated PNG, kept in the .ipynb, that any browser plays."""
-    from IPython.display import Image as InlineImage  # only a notebook has need of it
-
+    try:
+        from IPython.display import Image as InlineImage  # only a notebook has need of it
+    except ImportError as error:
+        raise ImportError('animate needs IPython: pip install "dqn_keras[notebooks]"') from error
     buffer = io.BytesIO()
     save_animation(frames, buffer, fps, width, format="PNG")
     return InlineImage(data=buffer.getvalue(), format="png")

@@ -1,13 +1,13 @@
 # %% [markdown]
 # # Deep Q-Network
 #
-# A pole stands on a cart. Ten times out of ten it wants to fall, and all we may do, fifty times a second, is push the
-# cart left or right. Nobody tells the program how; it is only told, at every step, whether the pole still stands.
+# A pole stands on a cart. Left alone, it always falls; all we may do, fifty times a second, is push the cart left or
+# right. Nobody tells the program how: it sees four numbers and, at every step, one reward as long as the pole stands.
 #
 # This notebook lets a small neural network find out, by **Q-learning** with the two ideas that made it work with
 # networks: a *replay memory* and a *target network*
 # ([Mnih et al. 2015](https://www.nature.com/articles/nature14236)). Everything it runs lives in the package
-# `dqn_keras`, and is shown here as it stands there.
+# `dqn_keras`; the parts that matter are shown here as they stand there.
 
 # %%
 import os
@@ -52,7 +52,7 @@ def source(*parts):
 # ## Parameters
 #
 # Every number of the algorithm, by the name that the text uses. All randomness of the notebook follows from the seed:
-# with the same one you get the same run, with another one another run.
+# the same seed gives the same run; another seed, another run.
 
 # %%
 config = Config()
@@ -87,7 +87,11 @@ print("Info:", info)
 # ## Two networks
 #
 # $Q(s, a)$ is to be the *return* one can expect after action $a$ in state $s$: the sum of all later rewards, each
-# discounted by $\gamma$ per step. With a good $Q$ acting is easy: take the action with the highest value.
+# discounted by $\gamma$ per step,
+#
+# $$Q(s_t, a_t) = \mathbb{E} \sum_{k \ge 0} \gamma^k \, r_{t+k}$$
+#
+# With a good $Q$ acting is easy: take the action with the highest value.
 #
 # We let a network approximate it: the state goes in, one value per action comes out. And we keep **two** of them.
 # Learning moves $Q(s, a)$ towards a target that itself contains the value of the next state; were both taken from
@@ -160,8 +164,8 @@ source(update_q_hat)
 source(gradient_step)
 
 # %% [markdown]
-# A trial, with networks of its own: the same random batch 300 times. Its loss must fall, and does, up to what moves
-# because $\hat Q$ moves.
+# A trial, with networks of its own: the same random batch 300 times. The loss falls by four fifths within a hundred
+# steps, then creeps up for a while: $\hat Q$ follows $Q$, so the targets themselves have moved.
 
 # %%
 from keras.optimizers import Adam
@@ -178,9 +182,10 @@ print("loss of steps 0, 100, 200, 299:", np.round([losses[i] for i in (0, 100, 2
 # %% [markdown]
 # ## The policy
 #
-# Who always takes the action that looks best never learns what the others are worth. So with probability
-# $\varepsilon$ the action is random. $\varepsilon$ starts at 1, when $Q$ knows nothing, falls by a factor 0.995 per
-# episode, and stops at 0.1.
+# An agent that always takes the action that looks best never learns what the others are worth. So with probability
+# $\varepsilon$ the action is random. $\varepsilon$ starts at 1, when $Q$ knows nothing, and falls after each episode:
+#
+# $$\varepsilon \leftarrow \max(0.995 \, \varepsilon,\; 0.1)$$
 
 # %%
 source(action, decay_epsilon)
@@ -188,15 +193,18 @@ source(action, decay_epsilon)
 # %% [markdown]
 # ## The replay memory
 #
-# Successive steps resemble each other; a network that learns them in their order forgets the last valley in the next.
-# So transitions are kept, the last 50,000 of them, and each learning step draws 64 at random, none twice. That makes
-# a batch nearly independent, and every experience is learned from several times.
+# Successive steps resemble each other; a network that learns them in their order forgets earlier situations while it
+# learns the present one. So transitions are kept, the last 50,000 of them, and each learning step draws 64 at random,
+# none twice. That makes a batch nearly independent, and every experience is learned from several times.
+
+# %%
+source(ReplayMemory.sample_rows)
 
 # %%
 memory = ReplayMemory(config.memory_size, num_features=4)
 state, _ = env.reset(seed=seed)
 for _ in range(10):
-    a = action(q_network(state[None]).numpy(), config.epsilon, rng)
+    a = action(q_network(state[None]), config.epsilon, rng)
     next_state, reward, terminated, truncated, _ = env.step(a)
     memory.append(Experience(state, a, reward, next_state, terminated))
     state = next_state
@@ -212,7 +220,8 @@ memory.sample(3, rng)
 source(gymnasium_loop._play_episode)
 
 # %% [markdown]
-# And the run: episode after episode, until the mean of the last 50 rewards is above 225, or 2,000 episodes are over.
+# And the run: `train` plays episode after episode, until the mean of the last 50 rewards is above 225, or 2,000
+# episodes are over. (The mean of fewer than 50 does not count: the one deviation from the original's rule.)
 
 # %%
 run = train(env, config, seed)
@@ -231,10 +240,10 @@ print(f"mean reward of the last 50 training episodes: {run.rewards[-50:].mean():
 ax = plot_rewards(run.rewards)
 _ = ax.axhline(config.solved_reward, color="gray", linestyle=":")
 # %% [markdown]
-# For a hundred and fifty episodes nothing seems to happen: actions are mostly random, and the pole falls after some
-# fifteen steps. But the memory fills, and as $\varepsilon$ falls the values begin to decide. Then the curve climbs, and
-# not smoothly: each better policy visits states that the memory knows little of. The dotted line is the mean that
-# counts as solved, over 50 episodes.
+# For about 170 episodes nothing seems to happen. The mean even sinks from 20 steps to 14: the network is trusted more
+# and more before it knows much. Then the memory holds enough, and the curve climbs, not smoothly, because each better
+# policy visits states that the memory knows little of. The dotted line is the mean that counts as solved, over 50
+# episodes.
 
 # %% tags=["save-pole"]
 picture_env = gym.make("CartPole-v1", render_mode="rgb_array")

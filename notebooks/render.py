@@ -8,6 +8,7 @@ written.
 """
 
 import base64
+import copy
 import sys
 from pathlib import Path
 
@@ -39,13 +40,13 @@ def convert(source: Path) -> nbformat.NotebookNode:
 def render(source: Path) -> Path:
     """Run one notebook and write it beside its script, and the pictures that it saves."""
     notebook = convert(source)
-    metadata = notebook.metadata
+    metadata = copy.deepcopy(notebook.metadata)
     NotebookClient(
         notebook, timeout=300, record_timing=False, coalesce_streams=True, resources={"metadata": {"path": NOTEBOOKS}}
     ).execute()
     notebook.metadata = metadata  # without the versions that the run has put in
     for cell in notebook.cells:
-        for tag in cell.metadata.get("tags", []):
+        for tag in (tag for tag in cell.metadata.get("tags", []) if tag.startswith("save-")):
             pictures = [output.data["image/png"] for output in cell.outputs if "image/png" in output.get("data", {})]
             (RESULTS / f"{tag.removeprefix('save-')}.png").write_bytes(base64.b64decode(pictures[0]))
     target = source.with_suffix(".ipynb")
@@ -55,6 +56,8 @@ def render(source: Path) -> Path:
 
 if __name__ == "__main__":
     names = sys.argv[1:]
+    if unknown := set(names) - {path.stem for path in sources()}:
+        sys.exit(f"no such notebook: {', '.join(sorted(unknown))}")
     for path in sources():
         if not names or path.stem in names:
             print(f"rendering {path.name} ...", flush=True)

@@ -1,3 +1,7 @@
+import os
+import subprocess
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -29,3 +33,28 @@ def random_batch(rng):
         )
 
     return make
+
+
+SCRIPT = """
+import gymnasium as gym
+from dqn_keras import train
+from dqn_keras.environments import CartPole
+from tests.test_training import QUICK, fingerprint
+print(fingerprint(train({env}, QUICK, seed={seed}, verbose=0)))
+"""
+
+
+@pytest.fixture
+def in_another_process():
+    """A function: (expression that makes an env, seed) -> fingerprint of a quick run in a fresh process."""
+
+    def run(env, seed):
+        return subprocess.run(
+            [sys.executable, "-c", SCRIPT.format(env=env, seed=seed)],
+            env={**os.environ, "PYTHONHASHSEED": str(seed)},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+
+    return run

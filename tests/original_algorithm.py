@@ -25,34 +25,50 @@ MAX_STEPS = 1_000
 Transition = namedtuple("Transition", "state action reward next_state terminal_state")
 
 
-def run(env, q_network, q_hat_network, rng, reset_seed, memory_size=MEMORY_SIZE, epsilon=1.0):
+def run(
+    env,
+    q_network,
+    q_hat_network,
+    rng,
+    reset_seed,
+    memory_size=MEMORY_SIZE,
+    steps_per_update=STEPS_PER_UPDATE,
+    alpha=ALPHA,
+    gamma=GAMMA,
+    tau=TAU,
+    batch_size=BATCH_SIZE,
+    epsilon=1.0,
+    decay=DECAY,
+    epsilon_min=EPSILON_MIN,
+    max_steps=MAX_STEPS,
+):
     """Yield (step's action, reward, episode ended) for ever; the networks learn on the way."""
-    optimizer = Adam(learning_rate=ALPHA)
+    optimizer = Adam(learning_rate=alpha)
     optimizer.build(q_network.trainable_variables)
 
     @tf.function
     def learn(states, actions, rewards, next_states, terminal_states):
         with tf.GradientTape() as tape:
             best_next = tf.reduce_max(q_hat_network(next_states), axis=-1)
-            y = rewards + (1 - terminal_states) * GAMMA * best_next
-            pairs = tf.stack([tf.range(BATCH_SIZE), actions], axis=1)
+            y = rewards + (1 - terminal_states) * gamma * best_next
+            pairs = tf.stack([tf.range(batch_size), actions], axis=1)
             loss = mean_squared_error(y, tf.gather_nd(q_network(states), pairs))
         weights = q_network.trainable_variables
         optimizer.apply_gradients(zip(tape.gradient(loss, weights), weights, strict=True))
         for q_hat, q in zip(q_hat_network.weights, q_network.weights, strict=True):
-            q_hat.assign(TAU * q + (1 - TAU) * q_hat)
+            q_hat.assign(tau * q + (1 - tau) * q_hat)
 
     memory = deque(maxlen=memory_size)
     episode = 0
     while True:
         state, _ = env.reset(seed=reset_seed(episode))
-        for t in range(MAX_STEPS):
+        for t in range(max_steps):
             values = q_network(np.expand_dims(state, axis=0))
             a = rng.integers(values.shape[1]) if rng.random() < epsilon else np.argmax(values)
             next_state, reward, terminated, truncated, _ = env.step(a)
             memory.append(Transition(state, a, reward, next_state, terminated))
-            if t % STEPS_PER_UPDATE == 0 and len(memory) >= BATCH_SIZE:
-                chosen = rng.choice(len(memory), size=BATCH_SIZE, replace=False)
+            if t % steps_per_update == 0 and len(memory) >= batch_size:
+                chosen = rng.choice(len(memory), size=batch_size, replace=False)
                 batch = [memory[i] for i in chosen]
                 learn(
                     tf.constant(np.array([x.state for x in batch], np.float32)),
@@ -62,9 +78,9 @@ def run(env, q_network, q_hat_network, rng, reset_seed, memory_size=MEMORY_SIZE,
                     tf.constant(np.array([x.terminal_state for x in batch], np.float32)),
                 )
             state = next_state.copy()
-            yield int(a), float(reward), terminated or truncated
+            yield int(a), float(reward), terminated or truncated or t + 1 == max_steps
             if terminated or truncated:
                 break
-        if epsilon > EPSILON_MIN:
-            epsilon = max(epsilon * DECAY, EPSILON_MIN)
+        if epsilon > epsilon_min:
+            epsilon = max(epsilon * decay, epsilon_min)
         episode += 1

@@ -25,6 +25,7 @@ MISBEHAVING = {
         Corridor(reward=lambda t: None),
         r"env Corridor: the reward must be a number, got None in episode 0, step 0",
     ),
+    "no end": (Corridor(end=lambda t: None), r"terminated and truncated must be booleans, got \(None, False\)"),
     "a word as reward": (Corridor(reward=lambda t: "one"), r"the reward must be a number, got 'one'"),
     "another shape, late": (
         Corridor(length=9, observe=lambda position, t: np.zeros(3 if t == 2 else 2)),

@@ -2,7 +2,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from dqn_keras import evaluate, make_q_network
+from dqn_keras import Config, evaluate, make_q_network, train
 from tests.environments import Corridor
 
 
@@ -27,6 +27,19 @@ def test_the_seed_decides(cartpole):
     first, again, other = (evaluate(cartpole, network, 20, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
+
+
+def test_evaluation_starts_where_training_did_not():
+    starts = []
+    for play in (
+        lambda env: train(env, Config(num_episodes=9, batch_size=8), seed=0, verbose=0),
+        lambda env: evaluate(env, always(1), 9, seed=0),
+    ):
+        env = Corridor(length=2)
+        play(env)
+        starts.append(set(env.reset_seeds))
+    assert len(starts[0]) == len(starts[1]) == 9
+    assert not starts[0] & starts[1]
 
 
 def test_evaluation_changes_no_weight(cartpole):

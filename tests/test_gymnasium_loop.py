@@ -25,7 +25,7 @@ class Recorded(gym.Wrapper):
 def play(env, config, seed, num_steps):
     """Whole episodes of the loop until at least `num_steps` are played."""
     checked = CheckedEnv(env)
-    agent = make_agent(checked.num_features, checked.num_actions, config, seed)
+    agent = make_agent(checked.spaces.num_features, checked.spaces.num_actions, config, seed)
     played = []
     for episode in episodes(checked, agent, config):
         played.append(episode)
@@ -34,16 +34,35 @@ def play(env, config, seed, num_steps):
     return agent, played
 
 
-@pytest.mark.parametrize(("seed", "memory_size"), [(0, 50_000), (1, 50_000), (2, 500)], ids=["", "", "full memory"])
-def test_the_loop_is_the_originals_algorithm_step_for_step(cartpole, seed, memory_size):
+OTHERS = {
+    "steps_per_update": 3,
+    "alpha": 0.01,
+    "gamma": 0.8,
+    "tau": 0.2,
+    "batch_size": 16,
+    "epsilon": 0.9,
+    "decay": 0.97,
+    "epsilon_min": 0.2,
+    "max_steps": 40,
+}
+
+
+@pytest.mark.parametrize(
+    ("seed", "parameters"),
+    [(0, {}), (1, {}), (2, {"memory_size": 500}), (3, OTHERS)],
+    ids=["seed 0", "seed 1", "full memory", "other parameters"],
+)
+@pytest.mark.parametrize("jit_compile", [True, False], ids=["jit", "no jit"])
+def test_the_loop_is_the_originals_algorithm_step_for_step(cartpole, seed, parameters, jit_compile):
     env = Recorded(cartpole)
-    agent, played = play(env, Config(memory_size=memory_size), seed, 2_000)
+    config = Config(**parameters, jit_compile=jit_compile)
+    agent, played = play(env, config, seed, 2_000)
     actions = env.actions
 
-    twin = make_agent(4, 2, Config(), seed)
+    twin = make_agent(4, 2, config, seed)
     env.actions = []
     original = original_algorithm.run(
-        env, twin.q_network, twin.q_hat_network, twin.rng, lambda k: episode_seed(seed, k), memory_size
+        env, twin.q_network, twin.q_hat_network, twin.rng, lambda k: episode_seed(seed, k), **parameters
     )
     rewards, total = [], 0.0
     while len(rewards) < len(played):
@@ -132,8 +151,12 @@ def test_a_bad_number_stops_the_run_at_once_and_says_where(bad):
         play(at_reset, Config(), 0, 100)
 
 
+@pytest.mark.filterwarnings("error")
 def test_large_but_finite_numbers_pass():
-    play(Corridor(length=1, observe=lambda position, t: np.array([1e30, -1e30], np.float32)), Config(), 0, 5)
+    env = Corridor(length=100, limit=5, observe=lambda p, t: np.array([1e9, -1e9], np.float32), reward=lambda t: 1e8)
+    agent, _ = play(env, Config(batch_size=2), 0, 10)
+    assert agent.num_updates == 3
+    play(Corridor(length=1, observe=lambda position, t: np.array([3e38, 3e38], np.float32)), Config(), 0, 5)
 
 
 def test_weights_that_become_nan_stop_the_run_in_the_same_update(cartpole):
@@ -143,5 +166,5 @@ def test_weights_that_become_nan_stop_the_run_in_the_same_update(cartpole):
     for _ in range(10):
         next(loop)
     agent.q_hat_network.weights[0].assign(np.full((4, 64), np.nan))
-    with pytest.raises(ValueError, match=r"the loss became nan in episode 10, step 0: learning has diverged"):
+    with pytest.raises(ValueError, match=r"not finite in episode 10, step 0: learning has diverged"):
         next(loop)

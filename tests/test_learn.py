@@ -3,11 +3,13 @@ import weakref
 
 import keras
 import numpy as np
+import psutil
 import pytest
 import tensorflow as tf
 
 from dqn_keras import Experience, learn, loss_values, make_networks, update_q_hat
-from dqn_keras.learn import _compiled_step, _compiled_steps
+from dqn_keras.learn import _bound_steps
+from dqn_keras.programs import _programs
 from tests.oracle import Oracle
 
 
@@ -142,30 +144,73 @@ def test_agents_do_not_touch_one_another(random_batch):
         np.testing.assert_array_equal(a, b)
 
 
-def test_one_trace_per_agent_whatever_the_batch(random_batch):
-    networks = agent()
-    for i, batch_size in enumerate([64, 64, 32, 1, 64]):
+def test_one_trace_for_all_agents_alike_whatever_the_batch(random_batch, caplog):
+    learn(random_batch(), 0.95, *agent())
+    before = len(_programs)
+    for i, batch_size in enumerate([64, 64, 32, 1, 64, 64, 64]):
+        networks = agent(seed=i, alpha=0.001 * (i + 1))
         learn(random_batch(batch_size), 0.9 + i / 100, *networks, tau=0.1 * (i + 1))
         learn([tf.constant(x) for x in random_batch(batch_size)], np.float32(0.9), *networks)
-    assert _compiled_step(*networks, True).experimental_get_tracing_count() == 1
+    assert len(_programs) == before
+    assert "retracing" not in caplog.text
+
+
+def test_agents_that_differ_in_more_than_numbers_have_programs_of_their_own(random_batch):
+    batch, updates = random_batch(), []
+    for optimizer in (keras.optimizers.Adam(0.01), keras.optimizers.Adam(0.01, beta_1=0.0, clipnorm=1e-3)):
+        q_network, q_hat_network, _ = agent()
+        for _ in range(2):
+            learn(batch, 0.95, q_network, q_hat_network, optimizer)
+        updates.append(q_network.get_weights()[0])
+    assert not np.array_equal(*updates)
+
+
+def test_a_layer_frozen_between_two_calls_stays_as_it_is_and_wants_an_optimizer_that_knows(random_batch):
+    q_network, q_hat_network, optimizer = agent()
+    learn(random_batch(), 0.95, q_network, q_hat_network, optimizer)
+    q_network.layers[0].trainable = False
+    before = q_network.get_weights()
+    with pytest.raises(ValueError, match="optimizer must be built for q_network's trainable variables"):
+        learn(random_batch(), 0.95, q_network, q_hat_network, optimizer)
+    learn(random_batch(), 0.95, q_network, q_hat_network, keras.optimizers.Adam())
+    kernel, _, output, _ = q_network.get_weights()
+    np.testing.assert_array_equal(kernel, before[0])
+    assert not np.array_equal(output, before[2])
+
+
+def test_fifty_dropped_agents_leave_no_memory_behind(random_batch):
+    def use(seed):
+        networks = agent(seed)
+        learn(random_batch(), 0.95, *networks)
+
+    def resident():
+        gc.collect()
+        return psutil.Process().memory_info().rss / 1e6
+
+    for seed in range(10):
+        use(seed)
+    before = resident()
+    for seed in range(50):
+        use(seed)
+    # A compiled program of its own would take 7 MB an agent; Keras itself keeps up to 0.5 MB of each model.
+    assert resident() - before < 50 * 1.0
 
 
 def test_an_agent_that_is_dropped_is_forgotten(random_batch):
     networks, batch = agent(), random_batch()
     gc.collect()
-    before = len(_compiled_steps)
+    before = len(_bound_steps)
     learn(batch, 0.95, *networks)
-    assert len(_compiled_steps) == before + 1
+    assert len(_bound_steps) == before + 1
     watched = [weakref.ref(x) for x in networks]
     del networks
     gc.collect()
     assert [reference() for reference in watched] == [None, None, None]
-    assert len(_compiled_steps) == before
+    assert len(_bound_steps) == before
 
 
 def test_learn_can_be_called_in_a_tf_function(random_batch):
     inside, outside = agent(), agent()
-    inside[2].build(inside[0].trainable_variables)
     batch = random_batch()
     tf.function(lambda *fields: learn(fields, 0.95, *inside))(*batch)
     learn(batch, 0.95, *outside)
@@ -187,9 +232,15 @@ WRONG = {
     "actions in float": (lambda b: (b[0], b[1] + 0.5, *b[2:]), "actions must be whole numbers"),
     "an action too high": (lambda b: (b[0], b[1] + 1, *b[2:]), r"actions must lie in 0\.\.1, got 1\.\.2"),
     "an action below zero": (lambda b: (b[0], b[1] - 1, *b[2:]), r"actions must lie in 0\.\.1, got -1\.\.0"),
+    "an action beyond int32": (lambda b: (b[0], b[1].astype(np.int64) + 2**32, *b[2:]), "actions must lie in 0"),
+    "a terminal state of 255": (lambda b: (*b[:4], b[4] * 255), "terminal_states must be 0 or 1, got 255"),
+    "rewards in words": (lambda b: (*b[:2], ["one"] * 64, *b[3:]), "rewards must be numbers"),
+    "ragged states": (lambda b: ([[1.0], [1.0, 2.0]], *b[1:]), "states must be an array"),
+    "nothing for rewards": (lambda b: (*b[:2], None, *b[3:]), "rewards must have shape"),
+    "a reward of 1e39": (lambda b: (*b[:2], b[2] * 0 + np.float64(1e39), *b[3:]), "rewards must be finite in float32"),
     "no transition": (lambda b: tuple(x[:0] for x in b), "at least one transition"),
-    "a NaN reward": (lambda b: (*b[:2], b[2] * np.nan, *b[3:]), "rewards must be finite, got nan"),
-    "an infinite state": (lambda b: (b[0] / 0, *b[1:]), "states must be finite, got -?inf"),
+    "a NaN reward": (lambda b: (*b[:2], b[2] * np.nan, *b[3:]), "rewards must be finite in float32, got nan"),
+    "an infinite state": (lambda b: (b[0] / 0, *b[1:]), "states must be finite in float32, got -?inf"),
 }
 
 
@@ -213,5 +264,14 @@ def test_networks_that_do_not_belong_together_are_refused(random_batch):
     with pytest.raises(ValueError, match="Input layer"):
         learn(batch, 0.95, keras.Sequential([keras.layers.Dense(2)]), q_hat_network, optimizer)
     learn(batch, 0.95, q_network, q_hat_network, optimizer)
+    for gamma in (np.nan, 7, -0.1, "0.9", None, np.ones((64, 1))):
+        with pytest.raises((TypeError, ValueError), match=r"^gamma must be a finite number"):
+            learn(batch, gamma, q_network, q_hat_network, optimizer)
+        with pytest.raises((TypeError, ValueError), match=r"^tau must be a finite number"):
+            learn(batch, 0.95, q_network, q_hat_network, optimizer, tau=gamma)
+    with pytest.raises(TypeError, match=r"^optimizer must be a Keras optimizer, got 'adam'"):
+        learn(batch, 0.95, q_network, q_hat_network, "adam")
+    with pytest.raises(TypeError, match=r"^q_network must be a Keras model, got None"):
+        learn(batch, 0.95, None, q_hat_network, optimizer)
     with pytest.raises(ValueError, match="Unknown variable"):
         learn(batch, 0.95, *make_networks(4, 2), optimizer)

@@ -32,5 +32,5 @@ def test_all_is_public_and_there():
 
 def test_another_keras_backend_is_refused(monkeypatch):
     monkeypatch.setattr(keras.backend, "backend", lambda: "jax")
-    with pytest.raises(ImportError, match=r"^dqn_keras needs Keras on TensorFlow, but Keras runs on 'jax'"):
+    with pytest.raises(ImportError, match=r"^dqn_keras needs Keras on TensorFlow, not on 'jax'"):
         require_tensorflow_backend()

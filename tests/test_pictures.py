@@ -79,6 +79,23 @@ def test_an_inline_animation_is_an_animated_png(frames):
     assert b"acTL" in shown.data[:200]  # the chunk that marks an animated PNG
 
 
-def test_no_frames_are_refused(tmp_path):
+@pytest.mark.parametrize("suffix", ["gif", "png"])
+def test_a_colour_that_comes_late_is_shown(frames, suffix, tmp_path):
+    for frame in frames[4:]:
+        frame[30:] = (255, 0, 0)
+    save_animation(frames, tmp_path / f"square.{suffix}", width=60)
+    with Image.open(tmp_path / f"square.{suffix}") as picture:
+        picture.seek(picture.n_frames - 1)
+        red, green, _ = picture.convert("RGB").getpixel((30, 38))
+    assert red > 200 > 50 > green
+
+
+def test_bad_frames_are_refused(frames, tmp_path):
+    target = tmp_path / "nothing.gif"
     with pytest.raises(ValueError, match="at least one frame"):
-        save_animation([], tmp_path / "nothing.gif")
+        save_animation([], target)
+    with pytest.raises(ValueError, match=r"frames must be \[H, W, 3\] uint8, got \(40, 60\)"):
+        save_animation([frame[..., 0] for frame in frames], target)
+    for fps in (0, -5):
+        with pytest.raises(ValueError, match=r"^fps must be a whole number"):
+            save_animation(frames, target, fps=fps)

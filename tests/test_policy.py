@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import tensorflow as tf
 
 from dqn_keras import Config, action, decay_epsilon
 
@@ -26,6 +27,12 @@ def test_explores_below_epsilon_and_is_greedy_from_it_on(q):
     assert explore.calls == ["random()", "integers(3)"]
     assert action(q, 0.3, greedy) == 1
     assert greedy.calls == ["random()"]
+
+
+def test_values_of_many_states_are_refused_and_tensors_are_taken(rng):
+    with pytest.raises(ValueError, match="those of one state"):
+        action(np.zeros((10, 2)), 0.0, rng)
+    assert action(tf.constant([[1.0, 3.0]]), 0.0, rng) == 1
 
 
 def test_of_equal_values_the_first_is_taken(rng):

@@ -1,8 +1,5 @@
 import csv
 import hashlib
-import os
-import subprocess
-import sys
 
 import gymnasium as gym
 import keras
@@ -47,26 +44,10 @@ def test_the_stop_rule_wants_more_not_as_much():
     assert train(Corridor(length=100, limit=4), config, seed=0, verbose=0).solved_at is None
 
 
-SCRIPT = """
-import gymnasium as gym
-from dqn_keras import train
-from tests.test_training import QUICK, fingerprint
-print(fingerprint(train(gym.make("CartPole-v1"), QUICK, seed={seed}, verbose=0)))
-"""
-
-
-def test_one_seed_gives_the_same_bits_in_another_process_and_another_seed_does_not(cartpole):
+def test_one_seed_gives_the_same_bits_in_another_process_and_another_seed_does_not(cartpole, in_another_process):
     here = fingerprint(train(cartpole, QUICK, seed=5, verbose=0))
-    for seed, hash_seed, same in [(5, "1", True), (6, "0", False)]:
-        environment = {**os.environ, "PYTHONHASHSEED": hash_seed}
-        there = subprocess.run(
-            [sys.executable, "-c", SCRIPT.format(seed=seed)],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.strip()
-        assert (there == here) is same
+    assert in_another_process("gym.make('CartPole-v1')", seed=5) == here
+    assert in_another_process("gym.make('CartPole-v1')", seed=6) != here
 
 
 def test_no_seed_is_a_fresh_one_that_can_be_used_again(cartpole):
@@ -143,6 +124,21 @@ def test_keras_own_callbacks_work(cartpole, tmp_path):
     assert [float(row["reward"]) for row in rows] == run.rewards.tolist()
     assert keras.saving.load_model(model).optimizer is not None
     assert run.agent.optimizer.learning_rate.numpy() == pytest.approx(0.001 * 0.9**29)
+
+
+def test_an_error_at_the_end_of_training_is_not_swallowed():
+    class Full(keras.callbacks.Callback):
+        def on_train_end(self, logs=None):
+            raise OSError("disk full")
+
+    config = Config(num_episodes=60, batch_size=8, solved_reward=3.5)
+    with pytest.raises(OSError, match="disk full"):
+        train(Corridor(length=100, limit=4), config, seed=0, verbose=0, callbacks=[Full()])
+
+
+def test_the_networks_have_the_hidden_layers_of_the_config():
+    run = train(Corridor(length=2), Config(num_episodes=9, batch_size=8, hidden_units=(5, 3)), seed=0, verbose=0)
+    assert [layer.units for layer in run.q_network.layers] == [5, 3, 2]
 
 
 class Zeroed(keras.callbacks.Callback):

@@ -1,0 +1,271 @@
+"""Whole episodes of a functional environment in one program that XLA compiles: act, step, remember, learn.
+
+Three loops stand in one another: episodes; in them turns, each of which ends with an update; in them the env steps
+up to that update. Nothing random outlives a turn: its draws follow from the run's seed, the episode and the turn.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import tensorflow as tf
+from gymnasium.experimental.functional import FuncEnv
+
+from dqn_keras.agent import Agent, Episode, draws_key
+from dqn_keras.config import Config
+from dqn_keras.environment import Spaces, check_spaces
+from dqn_keras.learn import gradient_step
+from dqn_keras.policy import decay_epsilon
+from dqn_keras.programs import Learner, bind
+from dqn_keras.replay import unpack
+
+
+def episodes(
+    env: FuncEnv, spaces: Spaces, agent: Agent, config: Config, episodes_per_call: int = 100
+) -> Iterator[Episode]:
+    """Play and learn, episode after episode, until the run's last; `agent` is changed in place.
+
+    Up to `episodes_per_call` are played in one call of the program, which returns early where the stop rule may
+    hold: the agent is then as that episode left it. The results do not depend on the number.
+    """
+    memory = agent.memory
+    rows = tf.Variable(memory.rows)
+    num_appended = tf.Variable(memory.num_appended, dtype=tf.int32)
+    program = _bind_program(env, spaces, agent, config, episodes_per_call, (rows, num_appended))
+
+    while (first := len(agent.episodes)) < config.num_episodes:
+        epsilons = [agent.epsilon]
+        while len(epsilons) < episodes_per_call:
+            epsilons.append(decay_epsilon(epsilons[-1], config))
+        recent = np.full(config.solved_window, -np.inf)  # as if hopeless episodes had come before the first
+        rewards_before = [episode.reward for episode in agent.episodes[-config.solved_window :]]
+        recent[config.solved_window - len(rewards_before) :] = rewards_before
+        num_episodes = min(episodes_per_call, config.num_episodes - first)
+
+        arguments = (
+            draws_key(agent.seed),
+            np.int32(first),
+            np.int32(num_episodes),
+            np.array(epsilons, np.float32),
+            recent,
+        )
+        results = [x.numpy() for x in program(*map(tf.constant, arguments))]
+        played, rewards, steps, losses, updates, is_finite = results
+        memory.rows[:] = rows.numpy()
+        memory.num_appended = int(num_appended.numpy())
+        agent.num_updates += int(updates.sum())
+        agent.epsilon = decay_epsilon(epsilons[played - 1], config)
+        if not is_finite:
+            raise ValueError(
+                f"env {type(env).__name__}: an observation, a reward or the loss was not finite "
+                f"in episode {first + played - 1}, step {steps[played - 1] - 1}"
+            )
+        for i in range(played):
+            loss = float(losses[i] / updates[i]) if updates[i] else math.nan
+            agent.episodes.append(Episode(first + i, float(rewards[i]), int(steps[i]), epsilons[i], loss))
+        yield from agent.episodes[first:]
+
+
+def _bind_program(
+    env: FuncEnv,
+    spaces: Spaces,
+    agent: Agent,
+    config: Config,
+    episodes_per_call: int,
+    variables: tuple[tf.Variable, ...],
+) -> Callable[..., list[tf.Tensor]]:
+    if not config.jit_compile:
+        raise ValueError("jit_compile must be True for a functional environment, got False: its loop needs XLA")
+    constants = vars(env).items()
+    is_like_its_class = all(x is None or isinstance(x, int | float | str) for _, x in constants)
+    key = ("episodes", type(env), tuple(sorted(constants)) if is_like_its_class else env, config, episodes_per_call)
+    specs = (
+        tf.TensorSpec((), tf.int64),
+        tf.TensorSpec((), tf.int32),
+        tf.TensorSpec((), tf.int32),
+        tf.TensorSpec((episodes_per_call,)),
+        tf.TensorSpec((config.solved_window,), tf.float64),
+    )
+
+    def make_program(learner: Learner, variables: list[tf.Variable]) -> Callable:
+        return _Program(env, spaces, config, learner, *variables).play
+
+    return bind(key, make_program, specs, agent.learner, variables, jit_compile=True)
+
+
+def draw_bits(num: int, key: tf.Tensor, counter: Any) -> tf.Tensor:
+    """Random bits, [num] uint32, that follow from two int64 numbers (Philox, Salmon et al. 2011)."""
+    seed = tf.stack([key, tf.cast(counter, tf.int64)])
+    return tf.random.stateless_uniform([num], seed, minval=None, maxval=None, dtype=tf.uint32, alg="philox")
+
+
+def to_uniform(bits: tf.Tensor) -> tf.Tensor:
+    """Bits as float32 in [0, 1), in steps of 2^-24."""
+    return tf.cast(tf.bitwise.right_shift(bits, tf.constant(8, tf.uint32)), tf.float32) * 2.0**-24
+
+
+def to_integer(bits: tf.Tensor, bound: Any) -> tf.Tensor:
+    """Bits as int32 in [0, bound); no value is favoured by more than bound / 2^32."""
+    product = tf.cast(bits, tf.uint64) * tf.cast(bound, tf.uint64)
+    return tf.cast(tf.bitwise.right_shift(product, tf.constant(32, tf.uint64)), tf.int32)
+
+
+def sample_indices(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any) -> tf.Tensor:
+    """As many different indices in [0, size) as there are bits, uniformly: what is a repeat is drawn again.
+
+    An index goes only if an earlier one is equal, and every value is as likely to be hit; so by symmetry all sets of
+    different indices are equally likely.
+    """
+    batch_size = bits.shape[0]
+    is_earlier = tf.constant(np.triu(np.ones((batch_size, batch_size), bool), 1))  # [i, j]: i < j
+
+    def repeats(indices: tf.Tensor) -> tf.Tensor:
+        return tf.reduce_any((indices[:, None] == indices[None, :]) & is_earlier, axis=0)  # [B]
+
+    def redraw(indices: tf.Tensor, attempt: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
+        fresh = draw_bits(batch_size, key, tf.cast(counter, tf.int64) + attempt)
+        return tf.where(repeats(indices), to_integer(fresh, size), indices), attempt + _NEXT_ATTEMPT
+
+    first = tf.constant(_NEXT_ATTEMPT, tf.int64)
+    indices, _ = tf.while_loop(
+        lambda indices, _: tf.reduce_any(repeats(indices)), redraw, (to_integer(bits, size), first)
+    )
+    return indices
+
+
+_NEXT_ATTEMPT = 2**32  # above every turn's number
+
+
+class _Program:
+    """The program itself, for one environment and configuration; it is traced once, and runs for any agent."""
+
+    def __init__(
+        self,
+        env: FuncEnv,
+        spaces: Spaces,
+        config: Config,
+        learner: Learner,
+        rows: tf.Variable,
+        num_appended: tf.Variable,
+    ) -> None:
+        self._env, self._spaces, self._config, self._learner = env, spaces, config, learner
+        self._rows, self._num_appended = rows, num_appended
+        self._max_steps = min(config.max_steps, getattr(env, "max_episode_steps", config.max_steps))
+
+    def play(
+        self, key: tf.Tensor, first: tf.Tensor, num_episodes: tf.Tensor, epsilons: tf.Tensor, recent: tf.Tensor
+    ) -> tuple[tf.Tensor, ...]:
+        """The program: -> episodes played, and of each its reward, steps, sum of losses and updates; all finite?"""
+        capacity, window = epsilons.shape[0], recent.shape[0]
+
+        def is_to_go_on(i: tf.Tensor, rewards: tf.Tensor, *others: tf.Tensor) -> tf.Tensor:
+            # A little below the bound, so that `train`, which decides, is asked wherever rounding could matter.
+            may_be_solved = tf.reduce_mean(rewards[i : i + window]) > self._config.solved_reward - 1e-6
+            return (i < num_episodes) & others[-1] & ~((i > 0) & may_be_solved)
+
+        def play_one(i: tf.Tensor, rewards: tf.Tensor, *others: tf.Tensor) -> tuple[tf.Tensor, ...]:
+            *facts, _ = others
+            reward, *new, is_finite = self._play_episode(episode_key(key, first + i), epsilons[i])
+            facts = [tf.tensor_scatter_nd_update(x, [[i]], [fact]) for x, fact in zip(facts, new, strict=True)]
+            rewards = tf.tensor_scatter_nd_update(rewards, [[i + window]], [reward])
+            return i + 1, rewards, *facts, is_finite
+
+        counts = tf.zeros([capacity], tf.int32)
+        rewards = tf.concat([recent, tf.zeros([capacity], tf.float64)], axis=0)
+        start = (tf.constant(0), rewards, counts, tf.zeros([capacity]), counts, tf.constant(True))
+        played, rewards, *facts = tf.while_loop(is_to_go_on, play_one, start)
+        return played, rewards[window:], *facts
+
+    def _play_episode(self, key: tf.Tensor, epsilon: tf.Tensor) -> tuple[tf.Tensor, ...]:
+        """-> its reward, steps, sum of losses, updates, and whether all was finite."""
+        n, batch_size, memory_size = self._config.steps_per_update, self._config.batch_size, self._config.memory_size
+
+        def turn(state: Any, is_over: tf.Tensor, reward: tf.Tensor, steps: tf.Tensor, *sums: tf.Tensor) -> tuple:
+            loss, updates, is_finite = sums
+            number = (steps + n - 1) // n  # turn 0 is step 0, turn k the n steps up to step k n
+            bits = draw_bits(2 * n + batch_size, key, number)
+
+            def step(
+                state: Any, is_over: tf.Tensor, reward: tf.Tensor, t: tf.Tensor, _: Any, __: Any
+            ) -> tuple[Any, ...]:
+                j = (t + n - 1) % n
+                rng = tf.stack([key, -1 - tf.cast(t, tf.int64)])
+                state, new_reward, is_end, is_finite = self._step(state, epsilon, bits[j], bits[n + j], rng)
+                is_over = is_end | (t + 1 >= self._max_steps) | ~is_finite
+                return state, is_over, reward + tf.cast(new_reward, tf.float64), t + 1, t % n == 0, is_finite
+
+            def is_before_update(_: Any, is_over: tf.Tensor, __: Any, ___: Any, is_update: tf.Tensor, ____: Any):
+                return ~is_over & ~is_update
+
+            start = (state, is_over, reward, steps, tf.constant(False), is_finite)
+            state, is_over, reward, steps, is_update, is_finite = tf.while_loop(is_before_update, step, start)
+
+            is_update &= is_finite & (self._num_appended >= batch_size)
+            size = tf.minimum(self._num_appended, memory_size)
+            new_loss = tf.cond(
+                is_update,
+                lambda: self._update(sample_indices(bits[2 * n :], key, number, size)),
+                lambda: tf.constant(0.0),
+            )
+            is_finite &= tf.math.is_finite(new_loss)
+            sums = (loss + new_loss, updates + tf.cast(is_update, tf.int32), is_finite)
+            return state, is_over | ~is_finite, reward, steps, *sums
+
+        zero, state = tf.constant(0), self._env.initial(tf.stack([key, tf.constant(-(2**62), tf.int64)]))
+        start = (state, tf.constant(False), tf.constant(0, tf.float64), zero, tf.constant(0.0), zero, tf.constant(True))
+        _, _, *sums = tf.while_loop(lambda state, is_over, *_: ~is_over, turn, start)
+        return tuple(sums)
+
+    def _step(
+        self, state: Any, epsilon: tf.Tensor, bits: tf.Tensor, action_bits: tf.Tensor, rng: tf.Tensor
+    ) -> tuple[Any, tf.Tensor, tf.Tensor, tf.Tensor]:
+        """One env step, remembered: -> next state, reward, terminated, finite."""
+        env, first_action = self._env, self._spaces.first_action
+        observation = tf.cast(env.observation(state, rng), tf.float32)  # [F]
+        greedy = tf.argmax(self._learner.q_network(observation[None])[0], output_type=tf.int32)
+        a = tf.where(to_uniform(bits) < epsilon, to_integer(action_bits, self._spaces.num_actions), greedy)
+
+        next_state = env.transition(state, a + first_action, rng)
+        next_observation = tf.cast(env.observation(next_state, rng), tf.float32)
+        reward = tf.cast(env.reward(state, a + first_action, next_state, rng), tf.float32)
+        terminated = tf.cast(env.terminal(next_state, rng), tf.bool)
+
+        scalars = tf.stack([tf.cast(a, tf.float32), reward, tf.cast(terminated, tf.float32)])
+        row = tf.concat([observation, next_observation, scalars], axis=0)
+        self._rows.scatter_nd_update([[self._num_appended % self._config.memory_size]], row[None])
+        self._num_appended.assign_add(1)
+
+        is_finite = tf.reduce_all(tf.math.is_finite(next_observation)) & tf.math.is_finite(reward)
+        return next_state, reward, terminated, is_finite
+
+    def _update(self, indices: tf.Tensor) -> tf.Tensor:
+        batch = unpack(tf.gather(self._rows, indices), self._spaces.num_features)
+        return gradient_step(batch, self._config.gamma, *self._learner, self._config.tau)
+
+
+def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:
+    """The number that all of an episode's draws follow from, int64."""
+    return tf.bitcast(draw_bits(2, key, episode), tf.int64)
+
+
+def check_functional(env: FuncEnv) -> Spaces:
+    """The sizes of its spaces; an error that names the environment if the loop cannot play it."""
+    name = type(env).__name__
+    spaces = check_spaces(name, env.observation_space, env.action_space)
+    rng = tf.constant([0, 0], tf.int64)
+    state = env.initial(rng)
+    next_state = env.transition(state, tf.constant(spaces.first_action), rng)
+    specs = [
+        tf.nest.map_structure(lambda x: (tf.shape(x).numpy().tolist(), x.dtype.name), s) for s in (state, next_state)
+    ]
+    if specs[0] != specs[1]:
+        raise ValueError(f"env {name}: transition must return a state like initial's, {specs[0]}, got {specs[1]}")
+    for part, value, shape in [
+        ("observation", env.observation(state, rng), (spaces.num_features,)),
+        ("reward", env.reward(state, tf.constant(spaces.first_action), next_state, rng), ()),
+        ("terminal", env.terminal(state, rng), ()),
+    ]:
+        if tuple(tf.shape(value)) != shape:
+            raise ValueError(f"env {name}: {part} must have shape {shape}, got {tuple(tf.shape(value).numpy())}")
+    return spaces

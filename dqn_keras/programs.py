@@ -1,0 +1,115 @@
+"""Compiled programs, shared by all agents of one shape.
+
+TensorFlow traces and XLA compiles a function for the very variables that it names, and neither is ever freed: a second
+agent would cost a second of compilation and megabytes that stay. So a program is traced on a *template*, networks
+and optimizer of the same configuration, and then called with the variables of any agent like it in their place.
+"""
+
+import json
+from collections.abc import Callable, Hashable, Sequence
+from numbers import Real
+from typing import Any, NamedTuple
+
+import keras
+import tensorflow as tf
+
+from dqn_keras._tensorflow import explain_missing_xla
+
+
+class Learner(NamedTuple):
+    """The three that a learning step changes."""
+
+    q_network: keras.Model
+    q_hat_network: keras.Model
+    optimizer: keras.Optimizer
+
+    @property
+    def variables(self) -> list[keras.Variable]:
+        """All that they hold, in an order that their configuration fixes."""
+        return [*self.q_network.variables, *self.q_hat_network.variables, *self.optimizer.variables]
+
+    def template(self) -> "Learner":
+        """New ones of the same configuration, with variables of their own."""
+        q_network, q_hat_network = map(keras.models.clone_model, (self.q_network, self.q_hat_network))
+        optimizer = type(self.optimizer).from_config(self.optimizer.get_config())
+        optimizer.build(q_network.trainable_variables)
+        return Learner(q_network, q_hat_network, optimizer)
+
+    def configuration(self) -> Hashable:
+        """Equal for two learners that one program can serve. Weights and the learning rate are not part of it."""
+        optimizer_config = self.optimizer.get_config()
+        if isinstance(optimizer_config.get("learning_rate"), Real):
+            del optimizer_config["learning_rate"]  # a variable
+        parts = (
+            _structure(self.q_network.get_config()),
+            _structure(self.q_hat_network.get_config()),
+            _structure(optimizer_config),
+        )
+        variables = [(tuple(v.shape), v.dtype, v.trainable) for v in self.variables]
+        return type(self.optimizer), json.dumps(parts, sort_keys=True, default=repr), tuple(variables)
+
+
+def _structure(config: Any) -> Any:
+    """A Keras configuration without names, and without initializers: they have done their work."""
+    if isinstance(config, dict):
+        kept = {k: v for k, v in config.items() if k != "name" and not k.endswith("_initializer")}
+        return {k: v if k == "dtype" else _structure(v) for k, v in kept.items()}
+    return [_structure(x) for x in config] if isinstance(config, list | tuple) else config
+
+
+class _Program(NamedTuple):
+    function: Any
+    captured: list[int | tf.Tensor]
+    """What the function takes beside its arguments: the number of a variable, or a constant."""
+    kept_alive: Any
+
+
+_programs: dict[Hashable, _Program] = {}
+
+
+def bind(
+    key: Hashable,
+    make_function: Callable[[Learner, list[tf.Variable]], Callable],
+    specs: Sequence[tf.TensorSpec],
+    learner: Learner,
+    variables: Sequence[tf.Variable] = (),
+    *,
+    jit_compile: bool,
+) -> Callable[..., list[tf.Tensor]]:
+    """A compiled function of tensors that reads and changes `learner` and `variables`: tensors -> flat outputs.
+
+    Args:
+        key: tells apart the functions that `make_function` can make for one configuration of the learner.
+        make_function: the template and its extra variables -> a function of tensors as in `specs`.
+        specs: of the arguments.
+        learner: the agent's own.
+        variables: further tf.Variables that the function changes.
+        jit_compile: by XLA.
+    """
+    key = (key, learner.configuration(), tuple(specs), jit_compile)
+    if key not in _programs:
+        template, extra = learner.template(), [tf.Variable(tf.zeros_like(v)) for v in variables]
+        if [v.shape for v in template.variables] != [v.shape for v in learner.variables]:
+            raise ValueError("optimizer must be built for q_network's trainable variables, all of them and no other")
+        function = tf.function(make_function(template, extra), jit_compile=jit_compile, autograph=False)
+        concrete = function.get_concrete_function(*specs)
+        numbers = {id(handle): i for i, handle in enumerate(_handles(template, extra))}
+        captured = [numbers.get(id(x), x) for x in concrete.captured_inputs]
+        _programs[key] = _Program(concrete.inference_fn, captured, (concrete, template, extra))
+    program, handles = _programs[key], _handles(learner, variables)
+    captured = [handles[x] if isinstance(x, int) else x for x in program.captured]
+
+    def call(*tensors: tf.Tensor) -> list[tf.Tensor]:
+        # Calling the ConcreteFunction would also first bind its arguments to a signature: half of a step's time.
+        with explain_missing_xla():
+            return _call_flat(program.function, *tensors, *captured)
+
+    return call
+
+
+def _call_flat(function: Any, *tensors: tf.Tensor) -> list[tf.Tensor]:
+    return function.call_flat(*tensors)
+
+
+def _handles(learner: Learner, variables: Sequence[tf.Variable]) -> list[tf.Tensor]:
+    return [*(v.value.handle for v in learner.variables), *(v.handle for v in variables)]

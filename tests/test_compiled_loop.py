@@ -1,0 +1,262 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+import tensorflow as tf
+from gymnasium.experimental.functional import FuncEnv
+from scipy import stats
+
+from dqn_keras import Config, learn, train
+from dqn_keras.agent import draws_key, make_agent
+from dqn_keras.compiled_loop import (
+    draw_bits,
+    episode_key,
+    episodes,
+    sample_indices,
+    to_integer,
+    to_uniform,
+)
+from dqn_keras.environment import Spaces
+from dqn_keras.environments import CartPole
+from dqn_keras.policy import decay_epsilon
+from dqn_keras.replay import unpack
+from tests.test_training import QUICK, Tape, fingerprint
+
+START = tf.constant(-(2**62), tf.int64)
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A hundred and some episodes, every transition of them kept."""
+    return train(CartPole(), Config(num_episodes=120, solved_reward=1e9), seed=0, verbose=0)
+
+
+def transitions(run):
+    """The memory, oldest first, cut into episodes."""
+    batch = unpack(run.agent.memory.rows[: len(run.agent.memory)], run.agent.memory.num_features)
+    ends = np.cumsum([episode.steps for episode in run.episodes])
+    assert ends[-1] == len(run.agent.memory)
+    return [type(batch)(*(field[i:j] for field in batch)) for i, j in zip([0, *ends], ends, strict=False)]
+
+
+def test_whole_episodes_replayed_in_gymnasium_agree(run, cartpole):
+    played = transitions(run)
+    assert len(played) == 120
+    initial = tf.function(CartPole().initial, jit_compile=True)  # XLA draws other float64 numbers than TensorFlow
+    for number, episode in enumerate(played):
+        cartpole.reset(seed=0)
+        key = episode_key(tf.constant(draws_key(0)), tf.constant(number))
+        cartpole.unwrapped.state = initial(tf.stack([key, START])).numpy()
+        np.testing.assert_array_equal(episode.state[0], cartpole.unwrapped.state.astype(np.float32))
+        for t, a in enumerate(episode.action):
+            observation, reward, terminated, truncated, _ = cartpole.step(int(a))
+            np.testing.assert_allclose(episode.next_state[t], observation, rtol=0, atol=1e-5)
+            assert (reward, terminated) == (episode.reward[t], episode.terminal_state[t])
+        assert terminated or truncated
+        assert run.episodes[number].steps == len(episode.action)
+        assert run.episodes[number].reward == episode.reward.sum()
+
+
+def test_its_draws_actions_and_updates_replayed_step_by_step_through_learn_agree(run):
+    config, agent = run.config, make_agent(4, 2, run.config, 0)
+    rows, num_steps, epsilon, updates = run.agent.memory.rows, 0, 1.0, 0
+    n, batch_size = config.steps_per_update, config.batch_size
+    close_calls = 0
+    for number, episode in enumerate(transitions(run)):
+        key = episode_key(tf.constant(draws_key(0)), tf.constant(number))
+        for t, a in enumerate(episode.action):
+            turn, j = (t + n - 1) // n, (t + n - 1) % n
+            if j == 0 or t == 0:
+                bits = draw_bits(2 * n + batch_size, key, turn)
+            if to_uniform(bits)[j] < np.float32(epsilon):
+                assert a == to_integer(bits, 2)[n + j]
+            else:
+                q_values = agent.q_network(episode.state[t][None]).numpy()[0]
+                close_calls += a != q_values.argmax()
+                assert q_values[a] >= q_values.max() - 1e-3
+            num_steps += 1
+            if t % n == 0 and num_steps >= batch_size:
+                indices = sample_indices(bits[2 * n :], key, turn, num_steps).numpy()
+                learn(unpack(rows[indices], 4), config.gamma, *agent.learner, tau=config.tau)
+                updates += 1
+        epsilon = decay_epsilon(epsilon, config)
+    assert updates == run.agent.num_updates > 400
+    assert close_calls <= 2
+    for ours, theirs in [(run.q_network, agent.q_network), (run.q_hat_network, agent.q_hat_network)]:
+        for a, b in zip(ours.get_weights(), theirs.get_weights(), strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [64, 65, 100, 5_000])
+def test_a_batch_has_no_repeats_and_is_uniform(size):
+    @tf.function(jit_compile=True)
+    def draw(key):
+        def one(i):
+            return sample_indices(draw_bits(64, key, i), key, i, size)
+
+        return tf.map_fn(one, tf.range(2_000), fn_output_signature=tf.int32)
+
+    batches = draw(tf.constant(1, tf.int64)).numpy()
+    assert all(len(set(batch)) == 64 for batch in batches)
+    counts = np.bincount(batches.ravel(), minlength=size)
+    assert len(counts) == size
+    if size == 64:
+        assert (counts == 2_000).all()
+    else:  # without replacement the counts vary less than a multinomial's, by this factor
+        statistic = ((counts - counts.mean()) ** 2 / counts.mean()).sum() / (1 - 64 / size)
+        assert 1e-4 < stats.chi2.sf(statistic, size - 1) < 1 - 1e-4
+    assert stats.chisquare(np.bincount(batches[:, -1], minlength=size)).pvalue > 1e-4
+
+
+def test_draws_are_uniform_and_differ_from_turn_to_turn_and_episode_to_episode():
+    keys = [episode_key(tf.constant(draws_key(seed)), tf.constant(k)) for seed in (0, 1) for k in range(50)]
+    bits = np.array([draw_bits(72, key, turn) for key in keys for turn in range(4)])
+    assert len(np.unique(bits)) > 0.9999 * bits.size
+    assert stats.kstest(to_uniform(tf.constant(bits.ravel())).numpy(), "uniform").pvalue > 1e-4
+    assert stats.chisquare(np.bincount(to_integer(tf.constant(bits.ravel()), 7).numpy())).pvalue > 1e-4
+
+
+def test_xla_draws_what_tensorflow_draws():
+    key = tf.constant(7, tf.int64)
+    np.testing.assert_array_equal(
+        tf.function(draw_bits, jit_compile=True)(8, key, tf.constant(3)), draw_bits(8, key, tf.constant(3))
+    )
+
+
+def test_one_seed_gives_the_same_bits_however_many_episodes_a_call_plays():
+    prints = []
+    for episodes_per_call in (1, 7, 100):
+        agent = make_agent(4, 2, QUICK, 3)
+        played = list(episodes(CartPole(), Spaces(4, 2, 0), agent, QUICK, episodes_per_call))
+        assert [e.number for e in played] == list(range(30))
+        prints.append([w.tobytes() for w in agent.q_network.get_weights()] + [[e.reward for e in played]])
+    assert prints[0] == prints[1] == prints[2]
+
+
+def test_one_seed_gives_the_same_bits_in_another_process_and_another_seed_does_not(in_another_process):
+    here = fingerprint(train(CartPole(), QUICK, seed=5, verbose=0))
+    assert in_another_process("CartPole()", seed=5) == here
+    assert in_another_process("CartPole()", seed=6) != here
+
+
+def test_an_agent_before_it_changes_nothing():
+    alone = fingerprint(train(CartPole(), QUICK, seed=1, verbose=0))
+    train(CartPole(), QUICK, seed=2, verbose=0)
+    assert fingerprint(train(CartPole(), QUICK, seed=1, verbose=0)) == alone
+
+
+def test_the_stop_rule_holds_after_each_episode_with_the_weights_of_that_moment():
+    config = Config(solved_reward=30.0, solved_window=5)
+    run = train(CartPole(), config, seed=0, verbose=0)
+    means = np.convolve(run.rewards, np.full(5, 1 / 5), mode="valid")
+    assert run.solved_at == len(run.rewards) - 1
+    assert means[-1] > 30
+    assert (means[:-1] <= 30).all()
+    # the same episodes, none after: weights, memory and counters are of that moment
+    stopped = train(CartPole(), Config(num_episodes=len(run.rewards), solved_reward=1e9), seed=0, verbose=0)
+    assert fingerprint(run) == fingerprint(stopped)
+    assert run.agent.num_updates == run.agent.optimizer.iterations.numpy()
+    assert run.agent.memory.num_appended == run.rewards.sum()
+
+
+def test_callbacks_see_every_episode():
+    tape = Tape(stop_after=4)
+    run = train(CartPole(), QUICK, seed=0, verbose=0, callbacks=[tape])
+    assert [call for call in tape.calls if call[0] == "ends"] == [("ends", k) for k in range(5)]
+    assert len(run.episodes) == 5
+    assert run.agent.memory.num_appended == run.rewards.sum()
+
+
+def test_a_full_memory_forgets_the_oldest():
+    run = train(CartPole(), Config(num_episodes=60, memory_size=200, solved_reward=1e9), seed=0, verbose=0)
+    memory = run.agent.memory
+    assert memory.num_appended == run.rewards.sum() > 200 == len(memory)
+    newest = (memory.num_appended - 1) % 200
+    follows = np.roll(np.arange(200), -1)
+    state, next_state = memory.rows[:, :4], memory.rows[:, 4:8]
+    goes_on = (memory.rows[:, 10] == 0) & (np.arange(200) != newest)
+    np.testing.assert_array_equal(next_state[goes_on], state[follows[goes_on]])
+
+
+class Counter(FuncEnv):
+    """Counts up; ends at 10. Written as a reader would, options replacing its parts; its actions are 5 and 6."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gym.spaces.Discrete(2, start=5)
+
+    def initial(self, rng, params=None):
+        return {"count": tf.constant(0), "actions": tf.constant(0)}
+
+    def transition(self, state, action, rng, params=None):
+        return {"count": state["count"] + 1, "actions": state["actions"] + action}
+
+    def observation(self, state, rng, params=None):
+        count = tf.cast(state["count"], tf.float32)
+        return tf.where(count == getattr(self, "bad_count", -1), self.__dict__.get("bad", 0.0), count)[None]
+
+    def reward(self, state, action, next_state, rng, params=None):
+        return tf.cast(action, tf.float32)
+
+    def terminal(self, state, rng, params=None):
+        return state["count"] >= 10
+
+
+def test_any_functional_environment_trains():
+    run = train(Counter(), Config(num_episodes=20, solved_reward=1e9), seed=0, verbose=0)
+    assert [e.steps for e in run.episodes] == [10] * 20
+    assert set(np.unique(run.agent.memory.rows[:200, 3])) == {5.0, 6.0}  # rewards are the env's own actions
+    assert set(np.unique(run.agent.memory.rows[:200, 2])) == {0.0, 1.0}
+    short = train(Counter(), Config(num_episodes=20, max_steps=4, solved_reward=1e9), seed=0, verbose=0)
+    assert [e.steps for e in short.episodes] == [4] * 20
+    assert not short.agent.memory.rows[:, 4].any()  # left, not terminated
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_bad_number_stops_the_run_and_says_where(bad):
+    env = Counter({"bad": float(bad), "bad_count": 7.0})
+    with pytest.raises(ValueError, match=r"env Counter: .* was not finite in episode 0, step 6"):
+        train(env, Config(num_episodes=20), seed=0, verbose=0)
+
+
+WRONG = {
+    "observation": lambda self, state, rng, params=None: tf.zeros([2]),
+    "reward": lambda self, state, action, next_state, rng, params=None: tf.zeros([1]),
+    "terminal": lambda self, state, rng, params=None: tf.constant([False]),
+    "transition": lambda self, state, action, rng, params=None: state["count"],
+}
+
+
+@pytest.mark.parametrize("part", WRONG)
+def test_a_part_of_the_wrong_shape_is_named(part):
+    env = type("Broken", (Counter,), {part: WRONG[part]})()
+    with pytest.raises(ValueError, match=rf"env Broken: {part} must"):
+        train(env, QUICK, seed=0, verbose=0)
+
+
+def test_without_xla_the_error_says_what_works(monkeypatch, cartpole):
+    with pytest.raises(ValueError, match=r"jit_compile must be True for a functional environment"):
+        train(CartPole(), Config(jit_compile=False), seed=0, verbose=0)
+    assert train(cartpole, Config(num_episodes=9, batch_size=8, jit_compile=False), seed=0, verbose=0).agent.num_updates
+
+    def no_compiler(*_):
+        raise tf.errors.UnimplementedError(None, None, "Could not find compiler for platform Host")
+
+    monkeypatch.setattr("dqn_keras.programs._call_flat", no_compiler)
+    for env in (CartPole(), cartpole):
+        with pytest.raises(RuntimeError, match=r"XLA cannot compile on this machine; Config\(jit_compile=False\)"):
+            train(env, Config(num_episodes=9, batch_size=8), seed=0, verbose=0)
+
+
+def test_resident_memory_stays_flat_over_many_steps():
+    psutil = pytest.importorskip("psutil")
+    config = Config(num_episodes=10_000, solved_reward=1e9, epsilon=0.1)
+    agent = make_agent(4, 2, config, 0)
+    loop = episodes(CartPole(), Spaces(4, 2, 0), agent, config)
+
+    def play(num_steps):
+        end = agent.memory.num_appended + num_steps
+        while agent.memory.num_appended < end:
+            next(loop)
+        return psutil.Process().memory_info().rss / 1e6
+
+    before = play(50_000)
+    assert play(150_000) - before < 10  # MB; a copy of the 2.2 MB memory per call would show
