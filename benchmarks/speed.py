@@ -16,6 +16,7 @@ import itertools
 import os
 import platform
 import statistics
+import sys
 import time
 from collections.abc import Callable
 
@@ -23,7 +24,10 @@ import gymnasium as gym
 
 from dqn_keras import Config
 from dqn_keras.agent import episode_seed, make_agent
+from dqn_keras.compiled_loop import check_functional
+from dqn_keras.compiled_loop import episodes as compiled_loop_episodes
 from dqn_keras.environment import CheckedEnv
+from dqn_keras.environments import CartPole
 from dqn_keras.gymnasium_loop import episodes
 from tests import original_algorithm
 
@@ -41,6 +45,57 @@ def gymnasium_loop() -> Callable[[int], int]:
         while played < num_steps:
             played += next(loop).steps
         return played
+
+    return play
+
+
+def compiled_loop() -> Callable[[int], int]:
+    agent = make_agent(4, 2, CONFIG, SEED)
+    env = CartPole()
+    loop = compiled_loop_episodes(env, check_functional(env), agent, CONFIG)
+
+    def play(num_steps: int) -> int:
+        start = agent.memory.num_appended
+        while agent.memory.num_appended < start + num_steps:
+            next(loop)
+        return agent.memory.num_appended - start
+
+    return play
+
+
+def rejax() -> Callable[[int], int]:
+    """Four environments in parallel make its rhythm of one update per four env steps."""
+    import jax
+    from flax import linen as nn
+    from rejax import DQN
+    from rejax.networks import DiscreteQNetwork, EpsilonGreedyPolicy
+
+    agent = EpsilonGreedyPolicy(DiscreteQNetwork)(
+        hidden_layer_sizes=CONFIG.hidden_units, action_dim=2, activation=nn.relu
+    )
+    num_steps = 20_000
+    algorithm = DQN.create(
+        env="CartPole-v1",
+        num_envs=4,
+        total_timesteps=num_steps,
+        eval_freq=num_steps,
+        skip_initial_evaluation=True,
+        buffer_size=CONFIG.memory_size,
+        fill_buffer=CONFIG.batch_size,
+        batch_size=CONFIG.batch_size,
+        learning_rate=CONFIG.alpha,
+        gamma=CONFIG.gamma,
+        polyak=1 - CONFIG.tau,
+        eps_start=0.1,
+        eps_end=0.1,
+        ddqn=False,
+    ).replace(agent=agent, eval_callback=lambda *_: ())
+    compiled = jax.jit(algorithm.train)
+    keys = (jax.random.PRNGKey(k) for k in itertools.count())
+
+    def play(_: int) -> int:
+        jax.block_until_ready(compiled(next(keys)))
+        return num_steps
 
     return play
 
@@ -87,15 +142,29 @@ def stable_baselines3() -> Callable[[int], int]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=9, help="rounds that are timed (9)")
-    parser.add_argument("--seconds", type=float, default=2.0, help="about how long each program plays per round (2)")
+    parser.add_argument("--seconds", type=float, default=1.5, help="about how long each program plays per round (1.5)")
     arguments = parser.parse_args()
 
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    programs = {"dqn_keras, Gymnasium loop": gymnasium_loop, "the original's way, eager": eager_original}
-    if importlib.util.find_spec("stable_baselines3"):
-        programs["Stable-Baselines3"] = stable_baselines3
-    packages = ["tensorflow", "keras", "gymnasium", "numpy", "stable-baselines3"]
-    versions = [f"{p} {importlib.metadata.version(p)}" for p in packages[: len(programs) + 2]]
+    programs = {
+        "dqn_keras, compiled episodes": compiled_loop,
+        "dqn_keras, Gymnasium loop": gymnasium_loop,
+        "the original's way, eager": eager_original,
+    }
+    for module, name, make in [
+        ("stable_baselines3", "Stable-Baselines3", stable_baselines3),
+        ("rejax", "rejax", rejax),
+    ]:
+        if importlib.util.find_spec(module):
+            start = time.perf_counter()
+            importlib.import_module(module)
+            print(f"- {name}: imported in {time.perf_counter() - start:.1f} s", file=sys.stderr)
+            programs[name] = make
+        else:
+            print(f'{name} is left out: pip install "dqn_keras[benchmarks]"', file=sys.stderr)
+    packages = ["tensorflow", "keras", "gymnasium", "numpy", "stable-baselines3", "rejax", "jax"]
+    installed = [p for p in packages if importlib.util.find_spec(p.replace("-", "_"))]
+    versions = [f"{p} {importlib.metadata.version(p)}" for p in installed]
     print("# Env steps per second\n")
     print(
         "`python -m benchmarks.speed`: all programs in turn, in one process on one core; what is timed starts after the"
@@ -108,7 +177,7 @@ def main() -> None:
         start = time.perf_counter()
         plays[name] = make()
         plays[name](4 * CONFIG.batch_size)
-        print(f"- {name}: {time.perf_counter() - start:.1f} s from fresh networks to past the first update")
+        print(f"- {name}: {time.perf_counter() - start:.1f} s from fresh networks to past the first update, compiled")
         start = time.perf_counter()
         played = plays[name](500)
         num_steps[name] = int(played / (time.perf_counter() - start) * arguments.seconds)
@@ -119,13 +188,16 @@ def main() -> None:
             played = play(num_steps[name])
             speeds[name].append(played / (time.perf_counter() - start))
 
-    ours = speeds["dqn_keras, Gymnasium loop"]
-    print("\n| program | env steps/s, median (lowest to highest) | this package is faster by |")
-    print("|---|---|---|")
+    print(
+        "\n| program | env steps/s, median (lowest to highest) | compiled episodes are faster by | Gymnasium loop by |"
+    )
+    print("|---|---|---|---|")
     for name, values in speeds.items():
-        ratios = [a / b for a, b in zip(ours, values, strict=True)]
-        spread = f"{statistics.median(values):,.0f} ({min(values):,.0f} to {max(values):,.0f})"
-        print(f"| {name} | {spread} | {statistics.median(ratios):.1f} ({min(ratios):.1f} to {max(ratios):.1f}) |")
+        columns = [name, f"{statistics.median(values):,.0f} ({min(values):,.0f} to {max(values):,.0f})"]
+        for ours in list(speeds.values())[:2]:
+            ratios = [a / b for a, b in zip(ours, values, strict=True)]
+            columns.append(f"{statistics.median(ratios):.1f} ({min(ratios):.1f} to {max(ratios):.1f})")
+        print(f"| {' | '.join(columns)} |")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """TensorFlow, imported without a word, and checked to be the backend that Keras runs on."""
 
 import contextlib
+import functools
 import os
 from collections.abc import Iterator
 
@@ -36,15 +37,21 @@ def require_tensorflow_backend() -> None:
         raise ImportError(f"dqn_keras needs Keras on TensorFlow, not on {keras.backend.backend()!r}: {advice}")
 
 
-@contextlib.contextmanager
-def explain_missing_xla() -> Iterator[None]:
-    """Say in one line what to do where TensorFlow was built without XLA's compiler for this machine."""
+@functools.cache
+def require_xla() -> None:
+    """RuntimeError, with what to do, where TensorFlow has no XLA compiler for this machine."""
     import tensorflow as tf
 
     try:
-        yield
-    except (tf.errors.NotFoundError, tf.errors.UnimplementedError) as error:
+        _compile_something()
+    except tf.errors.OpError as error:
         raise RuntimeError(
             "XLA cannot compile on this machine; Config(jit_compile=False), or learn(..., jit_compile=False), does "
             f"without it in the Gymnasium loop ({error.message.splitlines()[0]})"
         ) from error
+
+
+def _compile_something() -> None:
+    import tensorflow as tf
+
+    tf.function(tf.identity, jit_compile=True)(tf.constant(0.0))

@@ -39,9 +39,10 @@ class CheckedEnv:
         except (TypeError, ValueError):
             wanted = "step() must return (observation, reward, terminated, truncated, info)"
             raise self._error(wanted, result) from None
-        if not isinstance(reward, SupportsFloat):
-            raise self._error("the reward must be a number", reward)
-        reward = float(reward)
+        if type(reward) is not float:
+            if not isinstance(reward, SupportsFloat):
+                raise self._error("the reward must be a number", reward)
+            reward = float(reward)
         if not abs(reward) <= _LARGEST:
             raise self._error("the reward must be finite in float32", reward)
         if not isinstance(terminated, _BOOLS) or not isinstance(truncated, _BOOLS):

@@ -81,6 +81,6 @@ def _bind_update(agent: Agent, config: Config) -> Callable[[np.ndarray], tuple[f
     def update(rows: np.ndarray) -> tuple[float, list[np.ndarray]]:
         flat = step(tf.constant(rows))[0].numpy()
         weights = [flat[i:j].reshape(shape) for i, j, shape in zip(ends, ends[1:], shapes, strict=False)]
-        return (float(flat[0]) if math.isfinite(flat.sum(dtype=np.float64)) else math.nan), weights
+        return (float(flat[0]) if np.isfinite(flat).all() else math.nan), weights
 
     return update

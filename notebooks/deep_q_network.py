@@ -16,6 +16,7 @@ os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # otherwise TensorFlow logs into the n
 os.environ["SDL_VIDEODRIVER"] = "dummy"  # pictures are drawn without a display
 
 import inspect
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -40,7 +41,14 @@ from dqn_keras import (
     train,
     update_q_hat,
 )
+from dqn_keras.environments import CartPole
 from dqn_keras.learn import gradient_step
+
+
+def measured_speed():
+    """The table that `python -m benchmarks.speed` has left in results/."""
+    lines = Path("../results/speed.md").read_text().splitlines()
+    return "\n".join(line for line in lines if line.startswith("|"))
 
 
 def source(*parts):
@@ -253,6 +261,20 @@ animate(record_episode(picture_env, run.q_network, seed=seed))
 # The first of those greedy episodes. Balance is no problem any more: many small pushes keep the pole upright. What
 # ends the episode is the cart, which drifts to the right until it leaves the track. With $\gamma = 0.95$ a reward
 # a hundred steps ahead weighs $0.95^{100} \approx 0.6\,\%$ of one now, so the edge begins to matter when it is near.
+
+# %% [markdown]
+# ## The same, compiled
+#
+# Written in TensorFlow, the environment can join the rest: then whole episodes, acting, stepping, remembering and
+# learning, are one program that XLA compiles. The algorithm is the same, the networks, the optimizer and
+# `gradient_step` are the same; only the random numbers differ, so this is another run. It needs some seconds to
+# compile; how fast both loops are after that is a measured table, see `results/speed.md`.
+
+# %%
+compiled_run = train(CartPole(), config, seed)
+
+# %%
+Markdown(measured_speed())
 
 # %% [markdown]
 # ## The claim, checked

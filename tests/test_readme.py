@@ -7,7 +7,9 @@ ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 
 
-@pytest.mark.parametrize("script", re.findall(r"```python\n(.*?)```", README, re.DOTALL), ids=["train", "learn"])
+@pytest.mark.parametrize(
+    "script", re.findall(r"```python\n(.*?)```", README, re.DOTALL), ids=["train", "compiled", "own env", "learn"]
+)
 def test_the_readmes_scripts_run(script):
     exec(compile(script, "README.md", "exec"), {})
 
