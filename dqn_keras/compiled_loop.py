@@ -43,13 +43,8 @@ def episodes(
         recent[config.solved_window - len(rewards_before) :] = rewards_before
         num_episodes = min(episodes_per_call, config.num_episodes - first)
 
-        arguments = (
-            draws_key(agent.seed),
-            np.int32(first),
-            np.int32(num_episodes),
-            np.array(epsilons, np.float32),
-            recent,
-        )
+        numbers = draws_key(agent.seed), np.int32(first), np.int32(num_episodes)
+        arguments = (*numbers, np.array(epsilons, np.float32), recent)
         results = [x.numpy() for x in program(*map(tf.constant, arguments))]
         played, rewards, steps, losses, updates, is_finite = results
         memory.rows[:] = rows.numpy()
@@ -57,9 +52,10 @@ def episodes(
         agent.num_updates += int(updates.sum())
         agent.epsilon = decay_epsilon(epsilons[played - 1], config)
         if not is_finite:
+            where = f"step {steps[played - 1] - 1}" if steps[played - 1] else "at the reset"
             raise ValueError(
                 f"env {type(env).__name__}: an observation, a reward or the loss was not finite "
-                f"in episode {first + played - 1}, step {steps[played - 1] - 1}"
+                f"in episode {first + played - 1}, {where}"
             )
         for i in range(played):
             loss = float(losses[i] / updates[i]) if updates[i] else math.nan
@@ -195,11 +191,10 @@ class _Program:
                 is_over = is_end | (t + 1 >= self._max_steps) | ~is_finite
                 return state, is_over, reward + tf.cast(new_reward, tf.float64), t + 1, t % n == 0, is_finite
 
-            def is_before_update(_: Any, is_over: tf.Tensor, __: Any, ___: Any, is_update: tf.Tensor, ____: Any):
-                return ~is_over & ~is_update
-
             start = (state, is_over, reward, steps, tf.constant(False), is_finite)
-            state, is_over, reward, steps, is_update, is_finite = tf.while_loop(is_before_update, step, start)
+            state, is_over, reward, steps, is_update, is_finite = tf.while_loop(
+                lambda state, is_over, reward, t, is_update, is_finite: ~is_over & ~is_update, step, start
+            )
 
             is_update &= is_finite & (self._num_appended >= batch_size)
             size = tf.minimum(self._num_appended, memory_size)
@@ -212,17 +207,28 @@ class _Program:
             sums = (loss + new_loss, updates + tf.cast(is_update, tf.int32), is_finite)
             return state, is_over | ~is_finite, reward, steps, *sums
 
-        zero, state = tf.constant(0), self._env.initial(tf.stack([key, tf.constant(-(2**62), tf.int64)]))
-        start = (state, tf.constant(False), tf.constant(0, tf.float64), zero, tf.constant(0.0), zero, tf.constant(True))
+        rng = tf.stack([key, tf.constant(-(2**62), tf.int64)])
+        state = self._env.initial(rng)
+        observation = tf.cast(self._env.observation(state, rng), tf.float32)
+        is_finite, zero = tf.reduce_all(tf.math.is_finite(observation)), tf.constant(0)
+        start = (
+            (state, observation),
+            ~is_finite,
+            tf.constant(0, tf.float64),
+            zero,
+            tf.constant(0.0),
+            zero,
+            is_finite,
+        )
         _, _, *sums = tf.while_loop(lambda state, is_over, *_: ~is_over, turn, start)
         return tuple(sums)
 
     def _step(
         self, state: Any, epsilon: tf.Tensor, bits: tf.Tensor, action_bits: tf.Tensor, rng: tf.Tensor
     ) -> tuple[Any, tf.Tensor, tf.Tensor, tf.Tensor]:
-        """One env step, remembered: -> next state, reward, terminated, finite."""
+        """One env step, remembered: -> next state, reward, terminated, finite. A state goes with its observation."""
         env, first_action = self._env, self._spaces.first_action
-        observation = tf.cast(env.observation(state, rng), tf.float32)  # [F]
+        state, observation = state  # [F] float32
         greedy = tf.argmax(self._learner.q_network(observation[None])[0], output_type=tf.int32)
         a = tf.where(to_uniform(bits) < epsilon, to_integer(action_bits, self._spaces.num_actions), greedy)
 
@@ -237,7 +243,7 @@ class _Program:
         self._num_appended.assign_add(1)
 
         is_finite = tf.reduce_all(tf.math.is_finite(next_observation)) & tf.math.is_finite(reward)
-        return next_state, reward, terminated, is_finite
+        return (next_state, next_observation), reward, terminated, is_finite
 
     def _update(self, indices: tf.Tensor) -> tf.Tensor:
         batch = unpack(tf.gather(self._rows, indices), self._spaces.num_features)

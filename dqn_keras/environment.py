@@ -40,7 +40,7 @@ class CheckedEnv:
             wanted = "step() must return (observation, reward, terminated, truncated, info)"
             raise self._error(wanted, result) from None
         if type(reward) is not float:
-            if not isinstance(reward, SupportsFloat):
+            if not isinstance(reward, SupportsFloat) or (isinstance(reward, np.ndarray) and reward.size != 1):
                 raise self._error("the reward must be a number", reward)
             reward = float(reward)
         if not abs(reward) <= _LARGEST:

@@ -214,9 +214,24 @@ def test_any_functional_environment_trains():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_bad_number_stops_the_run_and_says_where(bad):
-    env = Counter({"bad": float(bad), "bad_count": 7.0})
-    with pytest.raises(ValueError, match=r"env Counter: .* was not finite in episode 0, step 6"):
-        train(env, Config(num_episodes=20), seed=0, verbose=0)
+    for count, where in [(7.0, "step 6"), (0.0, "at the reset")]:
+        env = Counter({"bad": float(bad), "bad_count": count})
+        with pytest.raises(ValueError, match=rf"env Counter: .* was not finite in episode 0, {where}"):
+            train(env, Config(num_episodes=20), seed=0, verbose=0)
+
+
+class Noisy(Counter):
+    """Its observations are random."""
+
+    def observation(self, state, rng, params=None):
+        return tf.cast(state["count"], tf.float32)[None] + tf.random.stateless_normal([1], rng)
+
+
+def test_a_random_observation_is_made_once_for_each_state():
+    run = train(Noisy(), Config(num_episodes=20, solved_reward=1e9), seed=0, verbose=0)
+    for episode in transitions(run):
+        np.testing.assert_array_equal(episode.next_state[:-1], episode.state[1:])
+    assert len(np.unique(run.agent.memory.rows[:200, 0])) == 200
 
 
 WRONG = {
