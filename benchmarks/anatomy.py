@@ -2,7 +2,7 @@
 
     python -m benchmarks.anatomy > results/anatomy.md
 
-A part is timed as the best of seven passes over 3,000 turns of its loop. The parts do not add up to the whole exactly:
+A part is timed as the best of forty passes over 3,000 turns of its loop. The parts do not add up to the whole exactly:
 compiled together, they are fused in other ways.
 """
 
@@ -34,7 +34,7 @@ def microseconds(part: Callable[[tf.Tensor], tf.Tensor]) -> float:
     compiled = tf.function(loop, jit_compile=True, autograph=False).get_concrete_function()
     compiled().numpy()
     best = np.inf
-    for _ in range(7):
+    for _ in range(40):
         start = time.perf_counter()
         compiled().numpy()
         best = min(best, time.perf_counter() - start)
@@ -61,7 +61,7 @@ def whole_turn() -> tuple[float, float]:
     while agent.memory.num_appended < 60_000:  # learn to balance first
         next(loop)
     best = (np.inf, 0.0)
-    for _ in range(10):
+    for _ in range(40):
         steps, updates, start = agent.memory.num_appended, agent.num_updates, time.perf_counter()
         while agent.memory.num_appended == steps:
             next(loop)
@@ -104,7 +104,7 @@ def main() -> None:
         "draw 64 different indices": sample,
     }
     print("# Where the time of the compiled loop goes\n")
-    print("`python -m benchmarks.anatomy`, one core, best of seven. A turn is up to four env steps and an update.\n")
+    print("`python -m benchmarks.anatomy`, one core, best of forty. A turn is up to four env steps and an update.\n")
     print("| part | microseconds |")
     print("|---|---|")
     for name, part in parts.items():
