@@ -8,7 +8,7 @@ from dqn_keras._tensorflow import require_tensorflow_backend
 
 require_tensorflow_backend()
 
-from dqn_keras.agent import Agent, Episode
+from dqn_keras.agent import Agent, Episode, episode_seed
 from dqn_keras.config import Config
 from dqn_keras.evaluation import evaluate
 from dqn_keras.learn import learn, loss_values, update_q_hat
@@ -31,6 +31,7 @@ __all__ = [
     "action",
     "animate",
     "decay_epsilon",
+    "episode_seed",
     "evaluate",
     "learn",
     "loss_values",

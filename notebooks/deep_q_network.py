@@ -259,7 +259,7 @@ animate(record_episode(picture_env, run.q_network, seed=seed))
 
 # %% [markdown]
 # The first of those greedy episodes. Balance is no problem any more: many small pushes keep the pole upright. What
-# ends the episode is the cart, which drifts to the right until it leaves the track. With $\gamma = 0.95$ a reward
+# ends the episode is the cart, which drifts aside until it leaves the track. With $\gamma = 0.95$ a reward
 # a hundred steps ahead weighs $0.95^{100} \approx 0.6\,\%$ of one now, so the edge begins to matter when it is near.
 
 # %% [markdown]
