@@ -26,10 +26,23 @@ from tests.test_training import QUICK, Tape, fingerprint
 START = tf.constant(-(2**62), tf.int64)
 
 
-@pytest.fixture(scope="module")
-def run():
+OTHERS = {
+    "steps_per_update": 3,
+    "alpha": 0.005,
+    "gamma": 0.8,
+    "tau": 0.2,
+    "batch_size": 16,
+    "epsilon": 0.9,
+    "decay": 0.97,
+    "epsilon_min": 0.2,
+    "hidden_units": (8, 8),
+}
+
+
+@pytest.fixture(scope="module", params=[{}, OTHERS], ids=["the original's parameters", "others"])
+def run(request):
     """A hundred and some episodes, every transition of them kept."""
-    return train(CartPole(), Config(num_episodes=120, solved_reward=1e9), seed=0, verbose=0)
+    return train(CartPole(), Config(num_episodes=120, solved_reward=1e9, **request.param), seed=0, verbose=0)
 
 
 def transitions(run):
@@ -60,7 +73,7 @@ def test_whole_episodes_replayed_in_gymnasium_agree(run, cartpole):
 
 def test_its_draws_actions_and_updates_replayed_step_by_step_through_learn_agree(run):
     config, agent = run.config, make_agent(4, 2, run.config, 0)
-    rows, num_steps, epsilon, updates = run.agent.memory.rows, 0, 1.0, 0
+    rows, num_steps, epsilon, updates = run.agent.memory.rows, 0, config.epsilon, 0
     n, batch_size = config.steps_per_update, config.batch_size
     close_calls = 0
     for number, episode in enumerate(transitions(run)):
