@@ -5,7 +5,7 @@ up to that update. Nothing random outlives a turn: its draws follow from the run
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from dqn_keras.replay import unpack
 
 def episodes(
     env: FuncEnv, spaces: Spaces, agent: Agent, config: Config, episodes_per_call: int = 100
-) -> Iterator[Episode]:
+) -> Generator[Episode, None, None]:
     """Play and learn, episode after episode, until the run's last; `agent` is changed in place.
 
     Up to `episodes_per_call` are played in one call of the program, which returns early where the stop rule may
@@ -119,15 +119,14 @@ def sample_indices(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any) -> 
     def repeats(indices: tf.Tensor) -> tf.Tensor:
         return tf.reduce_any((indices[:, None] == indices[None, :]) & is_earlier, axis=0)  # [B]
 
-    def redraw(indices: tf.Tensor, attempt: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
+    def redraw(indices: tf.Tensor, is_repeat: tf.Tensor, attempt: tf.Tensor) -> tuple[tf.Tensor, ...]:
         fresh = draw_bits(batch_size, key, tf.cast(counter, tf.int64) + attempt)
-        return tf.where(repeats(indices), to_integer(fresh, size), indices), attempt + _NEXT_ATTEMPT
+        indices = tf.where(is_repeat, to_integer(fresh, size), indices)
+        return indices, repeats(indices), attempt + _NEXT_ATTEMPT
 
-    first = tf.constant(_NEXT_ATTEMPT, tf.int64)
-    indices, _ = tf.while_loop(
-        lambda indices, _: tf.reduce_any(repeats(indices)), redraw, (to_integer(bits, size), first)
-    )
-    return indices
+    indices = to_integer(bits, size)
+    start = (indices, repeats(indices), tf.constant(_NEXT_ATTEMPT, tf.int64))
+    return tf.while_loop(lambda _, is_repeat, __: tf.reduce_any(is_repeat), redraw, start)[0]
 
 
 _NEXT_ATTEMPT = 2**32  # above every turn's number

@@ -5,7 +5,7 @@ CartPole and the forward pass of its network together, so the loop makes as few 
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from dqn_keras.programs import Learner, bind
 from dqn_keras.replay import Experience, unpack
 
 
-def episodes(env: CheckedEnv, agent: Agent, config: Config) -> Iterator[Episode]:
+def episodes(env: CheckedEnv, agent: Agent, config: Config) -> Generator[Episode, None, None]:
     """Play and learn, episode after episode, until the run's last; `agent` is changed in place."""
     update = _bind_update(agent, config)
     while len(agent.episodes) < config.num_episodes:

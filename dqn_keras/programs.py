@@ -28,9 +28,13 @@ class Learner(NamedTuple):
         """All that they hold, in an order that their configuration fixes."""
         return [*self.q_network.variables, *self.q_hat_network.variables, *self.optimizer.variables]
 
-    def template(self) -> "Learner":
+    def template(self, jit_compile: bool) -> "Learner":
         """New ones of the same configuration, with variables of their own."""
-        q_network, q_hat_network = map(keras.models.clone_model, (self.q_network, self.q_hat_network))
+        clone_layer = _clone_for_xla if jit_compile else None
+        q_network, q_hat_network = (
+            keras.models.clone_model(network, clone_function=clone_layer)
+            for network in (self.q_network, self.q_hat_network)
+        )
         optimizer = type(self.optimizer).from_config(self.optimizer.get_config())
         optimizer.build(q_network.trainable_variables)
         return Learner(q_network, q_hat_network, optimizer)
@@ -55,6 +59,39 @@ def _structure(config: Any) -> Any:
         kept = {k: v for k, v in config.items() if k != "name" and not k.endswith("_initializer")}
         return {k: v if k == "dtype" else _structure(v) for k, v in kept.items()}
     return [_structure(x) for x in config] if isinstance(config, list | tuple) else config
+
+
+def _clone_for_xla(layer: keras.layers.Layer) -> keras.layers.Layer:
+    is_narrow = type(layer) is keras.layers.Dense and 1 < layer.units <= 4 and layer.compute_dtype == "float32"
+    return (_NarrowDense if is_narrow else type(layer)).from_config(layer.get_config())
+
+
+class _NarrowDense(keras.layers.Dense):
+    """Keras' Dense for a few outputs, such as the values of a few actions; only its gradient is written otherwise.
+
+    TensorFlow's gradient is two products with a transposed matrix, for which XLA has only slow loops where the
+    matrix is so narrow: a third of a whole learning step of the 4-64-2 network.
+    """
+
+    def call(self, inputs: tf.Tensor, training: bool | None = None) -> tf.Tensor:
+        if len(inputs.shape) != 2:
+            return super().call(inputs, training)
+        outputs = _narrow_product(tf.convert_to_tensor(inputs), tf.convert_to_tensor(self.kernel))
+        if self.use_bias:
+            outputs += self.bias
+        return outputs if self.activation is None else self.activation(outputs)
+
+
+@tf.custom_gradient
+def _narrow_product(x: tf.Tensor, kernel: tf.Tensor) -> tuple[tf.Tensor, Callable]:
+    """The product of x [B, U] and kernel [U, A], and its gradient as a sum over the A columns."""
+
+    def gradient(dy: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:  # [B, A]
+        columns = range(kernel.shape[1])
+        dx = sum(dy[:, a, None] * kernel[None, :, a] for a in columns)  # [B, U]
+        return dx, tf.stack([tf.reduce_sum(x * dy[:, a, None], axis=0) for a in columns], axis=1)
+
+    return x @ kernel, gradient
 
 
 class _Program(NamedTuple):
@@ -90,7 +127,7 @@ def bind(
     if key not in _programs:
         if jit_compile:
             require_xla()
-        template, extra = learner.template(), [tf.Variable(tf.zeros_like(v)) for v in variables]
+        template, extra = learner.template(jit_compile), [tf.Variable(tf.zeros_like(v)) for v in variables]
         if [v.shape for v in template.variables] != [v.shape for v in learner.variables]:
             raise ValueError("optimizer must be built for q_network's trainable variables, all of them and no other")
         function = tf.function(make_function(template, extra), jit_compile=jit_compile, autograph=False)

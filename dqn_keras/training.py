@@ -97,7 +97,9 @@ def train(
     solved_at = None
 
     recent: deque[float] = deque(maxlen=max(100, config.solved_window))
-    with contextlib.closing(_with_callbacks(episodes, agent, config, callbacks)) as played:
+    if callbacks:
+        episodes = _with_callbacks(episodes, agent, config, callbacks)
+    with contextlib.closing(episodes) as played:
         for episode in played:
             recent.append(episode.reward)
             if verbose and episode.number % 100 == 0:

@@ -91,6 +91,22 @@ def test_learn_agrees_with_a_float64_oracle_over_200_batches(jit_compile, random
     assert worst < 1e-5
 
 
+@pytest.mark.parametrize("num_actions", [1, 2, 3, 4, 5])
+def test_narrow_layers_learn_the_same_whether_compiled_or_not(num_actions):
+    rng = np.random.default_rng(0)
+    states, next_states = rng.normal(size=(2, 32, 3)).astype(np.float32)
+    batch = (states, rng.integers(num_actions, size=32), rng.normal(size=32), next_states, np.zeros(32))
+    results = []
+    for jit_compile in (True, False):
+        q_network, q_hat_network = make_networks(3, num_actions, (8, 3), seed=0)
+        learn(batch, 0.95, q_network, q_hat_network, keras.optimizers.SGD(1.0), jit_compile=jit_compile)
+        results.append(q_network.get_weights())
+    start = make_networks(3, num_actions, (8, 3), seed=0)[0].get_weights()
+    for compiled, eager, before in zip(*results, start, strict=True):
+        assert (eager != before).any()
+        np.testing.assert_allclose(compiled, eager, rtol=1e-5, atol=1e-6)
+
+
 def test_the_gradient_agrees_with_the_oracle_and_is_qs_alone(random_batch):
     q_network, q_hat_network, _ = agent()
     q_hat_network.set_weights([w + 0.1 for w in q_hat_network.get_weights()])
