@@ -74,6 +74,7 @@ def whole_turn() -> tuple[float, float]:
 def main() -> None:
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # Linux
     agent, rng = make_agent(4, 2, CONFIG, 0), np.random.default_rng(0)
+    learner = agent.learner.template(jit_compile=True)  # whose layers are those that a program compiles
     data = rng.normal(size=agent.memory.rows.shape).astype(np.float32)
     data[:, 8:] = np.stack([rng.integers(2, size=len(data)), np.ones(len(data)), np.zeros(len(data))], axis=1)
     rows = tf.Variable(data)
@@ -84,12 +85,12 @@ def main() -> None:
         return unpack(tf.gather(rows, (indices + i) % CONFIG.memory_size), 4)
 
     def forward(i: tf.Tensor) -> tf.Tensor:
-        return loss_values(batch(i), CONFIG.gamma, agent.q_network, agent.q_hat_network)
+        return loss_values(batch(i), CONFIG.gamma, learner.q_network, learner.q_hat_network)
 
     def gradient(i: tf.Tensor) -> tf.Tensor:
         with tf.GradientTape() as tape:
             loss = forward(i)
-        return loss + 1e-9 * sum(tf.reduce_sum(g) for g in tape.gradient(loss, agent.q_network.trainable_variables))
+        return loss + 1e-9 * sum(tf.reduce_sum(g) for g in tape.gradient(loss, learner.q_network.trainable_variables))
 
     def sample(i: tf.Tensor) -> tf.Tensor:
         return tf.cast(tf.reduce_max(sample_indices(draw_bits(CONFIG.batch_size, key, i), key, i, 50_000)), tf.float32)
@@ -99,7 +100,7 @@ def main() -> None:
         "the same, and the loss (one pass through each network)": forward,
         "the same, and its gradient": gradient,
         "the same, with Adam and the soft update: the whole update": lambda i: gradient_step(
-            batch(i), CONFIG.gamma, *agent.learner, CONFIG.tau
+            batch(i), CONFIG.gamma, *learner, CONFIG.tau
         ),
         "draw 64 different indices": sample,
     }
@@ -117,8 +118,8 @@ def main() -> None:
     print(f"""
 The matrix products of an update are {flops:,} floating-point operations. At the {gigaflops:.0f} Gflop/s of a large
 product on this core they would take {flops / gigaflops / 1e3:.1f} microseconds: the physical limit, were small
-products as fast as large ones. The rest is what small ones cost (most of it the gradient's transposed products and its
-sums over the batch), the loop around them, random numbers, and the environment.""")
+products as fast as large ones. The rest is what small ones cost, the loop around them, random numbers, and the
+environment.""")
 
 
 if __name__ == "__main__":

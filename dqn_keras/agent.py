@@ -1,13 +1,14 @@
 """The agent: everything that a run changes, and the record of one of its episodes."""
 
 import dataclasses
+from collections.abc import Hashable
 from typing import NamedTuple
 
 import keras
 import numpy as np
 
 from dqn_keras.config import Config, count
-from dqn_keras.networks import make_networks
+from dqn_keras.networks import make_networks, renew_weights
 from dqn_keras.programs import Learner
 from dqn_keras.replay import ReplayMemory
 
@@ -52,19 +53,45 @@ class Episode(NamedTuple):
 
 def make_agent(num_features: int, num_actions: int, config: Config, seed: int) -> Agent:
     """An agent that has seen nothing; weights and random stream follow from `seed` alone."""
-    q_network, q_hat_network = make_networks(num_features, num_actions, config.hidden_units, _derived(seed, 0))
-    optimizer = keras.optimizers.Adam(learning_rate=config.alpha)
-    q_network.compile(optimizer=optimizer, loss="mse")  # Keras' callbacks and .keras files look for it there
-    optimizer.build(q_network.trainable_variables)
+    learner = _recycled.pop((num_features, num_actions, config.hidden_units), None)
+    if learner is None:
+        learner = _make_learner(num_features, num_actions, config, seed)
+    else:
+        _renew(learner, config, seed)
     return Agent(
         seed=seed,
-        q_network=q_network,
-        q_hat_network=q_hat_network,
-        optimizer=optimizer,
+        q_network=learner.q_network,
+        q_hat_network=learner.q_hat_network,
+        optimizer=learner.optimizer,
         memory=ReplayMemory(config.memory_size, num_features),
         rng=np.random.default_rng(_derived(seed, 1)),
         epsilon=config.epsilon,
     )
+
+
+def _make_learner(num_features: int, num_actions: int, config: Config, seed: int) -> Learner:
+    q_network, q_hat_network = make_networks(num_features, num_actions, config.hidden_units, _derived(seed, 0))
+    optimizer = keras.optimizers.Adam(learning_rate=config.alpha, name="adam")
+    q_network.compile(optimizer=optimizer, loss="mse")  # Keras' callbacks and .keras files look for it there
+    optimizer.build(q_network.trainable_variables)
+    return Learner(q_network, q_hat_network, optimizer)
+
+
+_recycled: dict[Hashable, Learner] = {}
+
+
+def recycle(agent: Agent, config: Config) -> None:
+    """Give up an agent, and have the next one of its shape made in its networks: to build them takes a while."""
+    _recycled[agent.memory.num_features, agent.q_network.output_shape[-1], config.hidden_units] = agent.learner
+
+
+def _renew(learner: Learner, config: Config, seed: int) -> None:
+    """Put networks and optimizer back to how `_make_learner` makes them for `seed`."""
+    renew_weights(learner.q_network, _derived(seed, 0))
+    learner.q_hat_network.set_weights(learner.q_network.get_weights())
+    for variable in learner.optimizer.variables:
+        variable.assign(np.zeros(variable.shape, variable.dtype))
+    learner.optimizer.learning_rate = config.alpha
 
 
 def episode_seed(seed: int, episode: int) -> int:

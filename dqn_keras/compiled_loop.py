@@ -5,6 +5,7 @@ up to that update. Nothing random outlives a turn: its draws follow from the run
 """
 
 import math
+import time
 from collections.abc import Callable, Generator
 from typing import Any
 
@@ -26,41 +27,48 @@ def episodes(
 ) -> Generator[Episode, None, None]:
     """Play and learn, episode after episode, until the run's last; `agent` is changed in place.
 
-    Up to `episodes_per_call` are played in one call of the program, which returns early where the stop rule may
-    hold: the agent is then as that episode left it. The results do not depend on the number.
+    Several are played in one call of the program, up to `episodes_per_call` or about `_SECONDS_PER_CALL`, so that a
+    run can be interrupted; it returns early where the stop rule may hold, and the agent is then as that episode left
+    it. The results do not depend on the number.
     """
     memory = agent.memory
     rows = tf.Variable(memory.rows)
     num_appended = tf.Variable(memory.num_appended, dtype=tf.int32)
     program = _bind_program(env, spaces, agent, config, episodes_per_call, (rows, num_appended))
 
+    at_once = 1
     while (first := len(agent.episodes)) < config.num_episodes:
+        start = time.perf_counter()
         epsilons = [agent.epsilon]
         while len(epsilons) < episodes_per_call:
             epsilons.append(decay_epsilon(epsilons[-1], config))
         recent = np.full(config.solved_window, -np.inf)  # as if hopeless episodes had come before the first
         rewards_before = [episode.reward for episode in agent.episodes[-config.solved_window :]]
         recent[config.solved_window - len(rewards_before) :] = rewards_before
-        num_episodes = min(episodes_per_call, config.num_episodes - first)
+        num_episodes = min(at_once, config.num_episodes - first)
 
         numbers = draws_key(agent.seed), np.int32(first), np.int32(num_episodes)
         arguments = (*numbers, np.array(epsilons, np.float32), recent)
         results = [x.numpy() for x in program(*map(tf.constant, arguments))]
-        played, rewards, steps, losses, updates, is_finite = results
+        played, rewards, steps, losses, updates, fault = results
         memory.rows[:] = rows.numpy()
         memory.num_appended = int(num_appended.numpy())
         agent.num_updates += int(updates.sum())
         agent.epsilon = decay_epsilon(epsilons[played - 1], config)
-        if not is_finite:
+        if fault:
             where = f"step {steps[played - 1] - 1}" if steps[played - 1] else "at the reset"
             raise ValueError(
-                f"env {type(env).__name__}: an observation, a reward or the loss was not finite "
-                f"in episode {first + played - 1}, {where}"
+                f"env {type(env).__name__}: {_FAULTS[fault]} was not finite in episode {first + played - 1}, {where}"
             )
         for i in range(played):
             loss = float(losses[i] / updates[i]) if updates[i] else math.nan
             agent.episodes.append(Episode(first + i, float(rewards[i]), int(steps[i]), epsilons[i], loss))
+        seconds = time.perf_counter() - start
+        at_once = max(1, min(episodes_per_call, int(played * _SECONDS_PER_CALL / seconds)))
         yield from agent.episodes[first:]
+
+
+_SECONDS_PER_CALL = 0.25
 
 
 def _bind_program(
@@ -132,6 +140,9 @@ def sample_indices(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any) -> 
 _NEXT_ATTEMPT = 2**32  # above every turn's number
 
 
+_FAULTS = ("nothing", "an observation", "a reward", "the loss or a weight")
+
+
 class _Program:
     """The program itself, for one environment and configuration; it is traced once, and runs for any agent."""
 
@@ -151,33 +162,33 @@ class _Program:
     def play(
         self, key: tf.Tensor, first: tf.Tensor, num_episodes: tf.Tensor, epsilons: tf.Tensor, recent: tf.Tensor
     ) -> tuple[tf.Tensor, ...]:
-        """The program: -> episodes played, and of each its reward, steps, sum of losses and updates; all finite?"""
+        """The program: -> episodes played, and of each its reward, steps, sum of losses and updates; the fault."""
         capacity, window = epsilons.shape[0], recent.shape[0]
 
         def is_to_go_on(i: tf.Tensor, rewards: tf.Tensor, *others: tf.Tensor) -> tf.Tensor:
             # A little below the bound, so that `train`, which decides, is asked wherever rounding could matter.
             may_be_solved = tf.reduce_mean(rewards[i : i + window]) > self._config.solved_reward - 1e-6
-            return (i < num_episodes) & others[-1] & ~((i > 0) & may_be_solved)
+            return (i < num_episodes) & (others[-1] == 0) & ~((i > 0) & may_be_solved)
 
         def play_one(i: tf.Tensor, rewards: tf.Tensor, *others: tf.Tensor) -> tuple[tf.Tensor, ...]:
             *facts, _ = others
-            reward, *new, is_finite = self._play_episode(episode_key(key, first + i), epsilons[i])
+            reward, *new, fault = self._play_episode(episode_key(key, first + i), epsilons[i])
             facts = [tf.tensor_scatter_nd_update(x, [[i]], [fact]) for x, fact in zip(facts, new, strict=True)]
             rewards = tf.tensor_scatter_nd_update(rewards, [[i + window]], [reward])
-            return i + 1, rewards, *facts, is_finite
+            return i + 1, rewards, *facts, fault
 
         counts = tf.zeros([capacity], tf.int32)
         rewards = tf.concat([recent, tf.zeros([capacity], tf.float64)], axis=0)
-        start = (tf.constant(0), rewards, counts, tf.zeros([capacity]), counts, tf.constant(True))
+        start = (tf.constant(0), rewards, counts, tf.zeros([capacity]), counts, tf.constant(0))
         played, rewards, *facts = tf.while_loop(is_to_go_on, play_one, start)
         return played, rewards[window:], *facts
 
     def _play_episode(self, key: tf.Tensor, epsilon: tf.Tensor) -> tuple[tf.Tensor, ...]:
-        """-> its reward, steps, sum of losses, updates, and whether all was finite."""
+        """-> its reward, steps, sum of losses, updates, and what was not finite in it, an index of _FAULTS."""
         n, batch_size, memory_size = self._config.steps_per_update, self._config.batch_size, self._config.memory_size
 
         def turn(state: Any, is_over: tf.Tensor, reward: tf.Tensor, steps: tf.Tensor, *sums: tf.Tensor) -> tuple:
-            loss, updates, is_finite = sums
+            loss, updates, fault = sums
             number = (steps + n - 1) // n  # turn 0 is step 0, turn k the n steps up to step k n
             bits = draw_bits(2 * n + batch_size, key, number)
 
@@ -186,46 +197,38 @@ class _Program:
             ) -> tuple[Any, ...]:
                 j = (t + n - 1) % n
                 rng = tf.stack([key, -1 - tf.cast(t, tf.int64)])
-                state, new_reward, is_end, is_finite = self._step(state, epsilon, bits[j], bits[n + j], rng)
-                is_over = is_end | (t + 1 >= self._max_steps) | ~is_finite
-                return state, is_over, reward + tf.cast(new_reward, tf.float64), t + 1, t % n == 0, is_finite
+                state, new_reward, is_end, fault = self._step(state, epsilon, bits[j], bits[n + j], rng)
+                is_over = is_end | (t + 1 >= self._max_steps) | (fault > 0)
+                return state, is_over, reward + tf.cast(new_reward, tf.float64), t + 1, t % n == 0, fault
 
-            start = (state, is_over, reward, steps, tf.constant(False), is_finite)
-            state, is_over, reward, steps, is_update, is_finite = tf.while_loop(
-                lambda state, is_over, reward, t, is_update, is_finite: ~is_over & ~is_update, step, start
+            start = (state, is_over, reward, steps, tf.constant(False), fault)
+            state, is_over, reward, steps, is_update, fault = tf.while_loop(
+                lambda state, is_over, reward, t, is_update, fault: ~is_over & ~is_update, step, start
             )
 
-            is_update &= is_finite & (self._num_appended >= batch_size)
+            is_update &= (fault == 0) & (self._num_appended >= batch_size)
             size = tf.minimum(self._num_appended, memory_size)
-            new_loss = tf.cond(
+            new_loss, is_finite = tf.cond(
                 is_update,
                 lambda: self._update(sample_indices(bits[2 * n :], key, number, size)),
-                lambda: tf.constant(0.0),
+                lambda: (tf.constant(0.0), tf.constant(True)),
             )
-            is_finite &= tf.math.is_finite(new_loss)
-            sums = (loss + new_loss, updates + tf.cast(is_update, tf.int32), is_finite)
+            fault = tf.where(is_finite, fault, 3)
+            sums = (loss + new_loss, updates + tf.cast(is_update, tf.int32), fault)
             return state, is_over | ~is_finite, reward, steps, *sums
 
         rng = tf.stack([key, tf.constant(-(2**62), tf.int64)])
         state = self._env.initial(rng)
         observation = tf.cast(self._env.observation(state, rng), tf.float32)
-        is_finite, zero = tf.reduce_all(tf.math.is_finite(observation)), tf.constant(0)
-        start = (
-            (state, observation),
-            ~is_finite,
-            tf.constant(0, tf.float64),
-            zero,
-            tf.constant(0.0),
-            zero,
-            is_finite,
-        )
+        zero, fault = tf.constant(0), tf.where(is_all_finite(observation), 0, 1)
+        start = ((state, observation), fault > 0, tf.constant(0, tf.float64), zero, tf.constant(0.0), zero, fault)
         _, _, *sums = tf.while_loop(lambda state, is_over, *_: ~is_over, turn, start)
         return tuple(sums)
 
     def _step(
         self, state: Any, epsilon: tf.Tensor, bits: tf.Tensor, action_bits: tf.Tensor, rng: tf.Tensor
     ) -> tuple[Any, tf.Tensor, tf.Tensor, tf.Tensor]:
-        """One env step, remembered: -> next state, reward, terminated, finite. A state goes with its observation."""
+        """One env step, remembered: -> next state, reward, terminated, fault. A state goes with its observation."""
         env, first_action = self._env, self._spaces.first_action
         state, observation = state  # [F] float32
         greedy = tf.argmax(self._learner.q_network(observation[None])[0], output_type=tf.int32)
@@ -241,12 +244,19 @@ class _Program:
         self._rows.scatter_nd_update([[self._num_appended % self._config.memory_size]], row[None])
         self._num_appended.assign_add(1)
 
-        is_finite = tf.reduce_all(tf.math.is_finite(next_observation)) & tf.math.is_finite(reward)
-        return (next_state, next_observation), reward, terminated, is_finite
+        fault = tf.where(is_all_finite(next_observation), tf.where(tf.math.is_finite(reward), 0, 2), 1)
+        return (next_state, next_observation), reward, terminated, fault
 
-    def _update(self, indices: tf.Tensor) -> tf.Tensor:
+    def _update(self, indices: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
+        """-> the loss, and whether it and the new weights are finite."""
         batch = unpack(tf.gather(self._rows, indices), self._spaces.num_features)
-        return gradient_step(batch, self._config.gamma, *self._learner, self._config.tau)
+        loss = gradient_step(batch, self._config.gamma, *self._learner, self._config.tau)
+        return loss, is_all_finite(loss, *self._learner.q_network.weights)
+
+
+def is_all_finite(*tensors: tf.Tensor) -> tf.Tensor:
+    """A boolean scalar."""
+    return tf.reduce_all([tf.reduce_all(tf.math.is_finite(x)) for x in tensors])
 
 
 def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:

@@ -1,6 +1,7 @@
 """The door between a gymnasium.Env and the rest: what comes through it is of the right kind, and finite."""
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
@@ -25,7 +26,7 @@ class CheckedEnv:
     def reset(self, seed: int, episode: int) -> np.ndarray:
         """Begin an episode with the environment seeded: its first state. The number is for messages."""
         self._episode, self._step = episode, -1
-        result = self._env.reset(seed=seed)
+        result = self._call(self._env.reset, seed=seed)
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._error("reset() must return (observation, info)", result)
         return self._checked_state(result[0])
@@ -33,7 +34,7 @@ class CheckedEnv:
     def step(self, a: int) -> tuple[np.ndarray, float, bool, bool]:
         """Next state, reward, terminated, truncated after the action of index `a`."""
         self._step += 1
-        result = self._env.step(self.spaces.first_action + a)
+        result = self._call(self._env.step, self.spaces.first_action + a)
         try:
             observation, reward, terminated, truncated, _ = result
         except (TypeError, ValueError):
@@ -60,9 +61,18 @@ class CheckedEnv:
             raise self._error("the observation must be finite in float32", observation)
         return state
 
+    def _call(self, method: Callable, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return method(*args, **kwargs)
+        except Exception as error:
+            error.add_note(f"raised by env {self.name} {self._where()}")
+            raise
+
+    def _where(self) -> str:
+        return f"in episode {self._episode}, {'at the reset' if self._step < 0 else f'step {self._step}'}"
+
     def _error(self, wanted: str, got: Any) -> ValueError:
-        where = "at the reset" if self._step < 0 else f"step {self._step}"
-        return ValueError(f"env {self.name}: {wanted}, got {got!r} in episode {self._episode}, {where}")
+        return ValueError(f"env {self.name}: {wanted}, got {got!r} {self._where()}")
 
 
 class Spaces(NamedTuple):

@@ -26,8 +26,7 @@ def make_q_network(
     """
     num_features, num_actions = count("num_features", num_features), count("num_actions", num_actions)
     hidden_units = counts("hidden_units", hidden_units)
-    seeds = np.random.default_rng(seed).integers(2**31, size=len(hidden_units) + 1)
-    *hidden, output = [GlorotUniform(seed=int(s)) for s in seeds]
+    *hidden, output = _initializers(len(hidden_units) + 1, seed)
     layers: list[keras.Layer] = [Input(shape=(num_features,), dtype="float32")]
     for i, (units, initializer) in enumerate(zip(hidden_units, hidden, strict=True), start=1):
         layers.append(
@@ -35,6 +34,19 @@ def make_q_network(
         )
     layers.append(Dense(num_actions, activation="linear", kernel_initializer=output, dtype="float32", name="q_values"))
     return Sequential(layers, name=name)
+
+
+def _initializers(num_layers: int, seed: int | np.random.SeedSequence | None) -> list[GlorotUniform]:
+    """Of the kernels, first to last."""
+    return [GlorotUniform(seed=int(s)) for s in np.random.default_rng(seed).integers(2**31, size=num_layers)]
+
+
+def renew_weights(network: Sequential, seed: int | np.random.SeedSequence | None) -> None:
+    """Give a network of `make_q_network` the weights that it would be made with."""
+    weights = []
+    for layer, initializer in zip(network.layers, _initializers(len(network.layers), seed), strict=True):
+        weights += [initializer(layer.kernel.shape), np.zeros(layer.units, np.float32)]
+    network.set_weights(weights)
 
 
 def make_networks(
@@ -99,7 +111,7 @@ def check_network(name: str, network: keras.Model) -> None:
 
 
 def check_fits(q_network: keras.Model, num_features: int, num_actions: int) -> None:
-    """ValueError if the network does not take this environment's states or give its actions' values."""
+    """ValueError if the network does not take this environment's states or give its actions' values, all finite."""
     check_network("q_network", q_network)
     shapes = (q_network.input_shape[1:], q_network.output_shape[1:])
     if shapes != ((num_features,), (num_actions,)):
@@ -107,3 +119,5 @@ def check_fits(q_network: keras.Model, num_features: int, num_actions: int) -> N
             f"q_network must map {num_features} features to {num_actions} actions, "
             f"got input {shapes[0]} and output {shapes[1]}"
         )
+    if not all(np.isfinite(w).all() for w in q_network.get_weights()):
+        raise ValueError("q_network must have finite weights, got NaN or infinity among them")

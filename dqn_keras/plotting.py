@@ -1,4 +1,4 @@
-"""Learning curves."""
+"""Learning curves: of one run, and of many."""
 
 from collections.abc import Sequence
 
@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from dqn_keras.config import count
+from dqn_keras.study import Study
 
 
 def plot_rewards(rewards: Sequence[float] | np.ndarray, ax: Axes | None = None, window: int = 20) -> Axes:
@@ -33,3 +34,58 @@ def plot_rewards(rewards: Sequence[float] | np.ndarray, ax: Axes | None = None, 
     ax.legend(loc="upper left")
     ax.grid(alpha=0.3)
     return ax
+
+
+def plot_study(
+    study: Study, axes: Sequence[Axes] | np.ndarray | None = None, published: float | None = 293
+) -> np.ndarray:
+    """Three pictures of many seeds: how they learn, when they are solved, and how many are, by when.
+
+    Args:
+        study: of at least two seeds.
+        axes: the three to draw in; by default a new figure of 15 by 4.5 inches.
+        published: an episode to mark as what one run was reported to need, as the original's 293; None marks nothing.
+    """
+    if axes is None:
+        _, axes = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained")
+    curves, distribution, shares = axes
+    window, config = study.config.solved_window, study.config
+    solved = np.sort(study.solved_at[np.isfinite(study.solved_at)])
+    num_seeds, num_unsolved = len(study.outcomes), len(study.outcomes) - len(solved)
+    until = int(1.5 * np.quantile(study.episodes_to_solved, 0.9)) + 1  # the curves of the rest go on beyond
+
+    means = np.full((num_seeds, study.rewards.shape[1]), np.nan)  # of the last `window` episodes
+    for row, outcome in zip(means, study.outcomes, strict=True):
+        mean = np.convolve(outcome.rewards, np.full(window, 1 / window), mode="valid")
+        row[window - 1 : window - 1 + len(mean)] = mean
+        row[len(outcome.rewards) :] = mean[-1] if len(mean) else np.nan  # a run that has ended stays where it was
+    means = means[:, :until]
+    faint = curves.plot(means.T, color="0.5", alpha=max(0.02, min(1, 10 / num_seeds)), linewidth=0.7)
+    faint[0].set_label("each seed")
+    episodes = np.arange(window - 1, means.shape[1])
+    low, median, high = np.nanquantile(means[:, window - 1 :], (0.25, 0.5, 0.75), axis=0)
+    curves.fill_between(episodes, low, high, color="tab:blue", alpha=0.35, label="middle half of the seeds")
+    curves.plot(episodes, median, color="tab:blue", linewidth=2, label="median")
+    curves.axhline(config.solved_reward, color="black", linestyle=":", linewidth=1, label="solved")
+    curves.set(xlabel="Episode", ylabel=f"Mean reward of the last {window} episodes", title=f"{num_seeds} seeds")
+    curves.legend(loc="lower right")
+
+    distribution.hist(np.minimum(solved, until), bins=40, color="tab:blue", alpha=0.7)
+    distribution.axvline(np.median(study.episodes_to_solved), color="tab:blue", linewidth=2, label="median")
+    late = int((solved > until).sum())
+    title = f"{late} later (in the last bar), {num_unsolved} not within {config.num_episodes:,}"
+    distribution.set(xlabel="Episodes to solved", ylabel="Seeds", title=title)
+
+    ends = [*solved, config.num_episodes]
+    shares.step(ends, np.minimum(np.arange(1, len(ends) + 1), len(solved)) / num_seeds, where="post", linewidth=2)
+    shares.set(xscale="log", xlabel="Episodes", ylabel="Share of seeds solved", ylim=(0, 1.02))
+    shares.set(title=f"{len(solved) / num_seeds:.1%} solved in the end", xlim=(0.8 * ends[0], config.num_episodes))
+    ticks = [k for k in (100, 200, 300, 500, 1_000, 2_000) if k <= config.num_episodes]
+    shares.set_xticks(ticks, map(str, ticks))
+    shares.minorticks_off()
+    shares.grid(alpha=0.3)
+    if published is not None:
+        for ax in (distribution, shares):
+            ax.axvline(published, color="tab:orange", linestyle="--", label=f"the one published run ({published:g})")
+    distribution.legend(loc="upper right")
+    return np.asarray(axes)

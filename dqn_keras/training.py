@@ -2,8 +2,8 @@
 
 import contextlib
 import dataclasses
+import os
 import warnings
-from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 
 import gymnasium as gym
@@ -13,8 +13,10 @@ from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras import compiled_loop, gymnasium_loop
 from dqn_keras.agent import Agent, Episode, checked_seed, make_agent
-from dqn_keras.config import Config
+from dqn_keras.checkpoint import Checkpoints, save_agent
+from dqn_keras.config import Config, count
 from dqn_keras.environment import CheckedEnv
+from dqn_keras.interruption import stop_requests
 
 
 @dataclasses.dataclass(repr=False)
@@ -24,8 +26,13 @@ class Run:
     config: Config
     agent: Agent
     """Networks, optimizer, memory and random state, as the last episode left them."""
-    solved_at: int | None
-    """The number (from 0) of the episode at whose end the stop rule held; None if it never did."""
+    interrupted: bool = False
+    """Whether Ctrl-C or SIGTERM ended it, at the end of an episode."""
+
+    @property
+    def solved_at(self) -> int | None:
+        """The number (from 0) of the episode at whose end the stop rule held; None if it never did."""
+        return len(self.episodes) - 1 if _is_solved(self.episodes, self.config) else None
 
     @property
     def episodes(self) -> list[Episode]:
@@ -52,6 +59,10 @@ class Run:
         """The slow copy that the targets were computed from."""
         return self.agent.q_hat_network
 
+    def save(self, path: str | os.PathLike) -> None:
+        """Save the network that acts, alone, as a .keras file; `load_agent`, or Keras anywhere, loads it."""
+        save_agent(path, self.q_network)
+
     def __repr__(self) -> str:
         outcome = "not solved" if self.solved_at is None else f"solved_at={self.solved_at}"
         return f"<Run: seed={self.seed}, {len(self.episodes)} episodes, {outcome}>"
@@ -64,6 +75,9 @@ def train(
     *,
     verbose: int = 1,
     callbacks: Sequence[keras.callbacks.Callback] = (),
+    checkpoint: str | os.PathLike | None = None,
+    checkpoint_every: int = 100,
+    resume: bool = False,
 ) -> Run:
     """Train a Deep Q-Network from scratch until it solves `env` or `config.num_episodes` are over.
 
@@ -75,6 +89,16 @@ def train(
         seed: a whole number. One seed, one result, bit for bit, on one machine; None draws one (see `run.seed`).
         verbose: 1 prints a line every 100 episodes and one when solved, 0 nothing.
         callbacks: Keras callbacks; an episode is an epoch, and its logs are number, reward, steps, epsilon, loss.
+        checkpoint: a folder for this run's checkpoints, each its whole state; None saves none. If the disk refuses
+            one on the way, that is a warning, and the run goes on.
+        checkpoint_every: episodes between two of them, or a few more where episodes are compiled; the start and the
+            end of the run are saved too.
+        resume: go on from the newest checkpoint in the folder that is whole, or start if there is none yet. The
+            result is that of a run that was never interrupted, bit for bit; `config` and `env` must be the same, but
+            for a num_episodes that may be larger. What callbacks remember is theirs to save.
+
+    Ctrl-C, an interrupted notebook cell and SIGTERM end the run at the end of an episode, saved if there is a
+    checkpoint, and `train` returns what there is, marked `interrupted`; a second one raises KeyboardInterrupt.
 
     Raises:
         TypeError, ValueError: an argument or a space is not supported; the environment returned a NaN,
@@ -84,42 +108,93 @@ def train(
         raise TypeError(f"config must be a Config, got {config!r}")
     if verbose not in (0, 1):
         raise ValueError(f"verbose must be 0 or 1, got {verbose!r}")
-    seed = checked_seed(seed)
+    if resume and checkpoint is None:
+        raise ValueError("resume needs a folder to resume from: checkpoint, got None")
+    checkpoint_every = count("checkpoint_every", checkpoint_every)
+    agent_seed = checked_seed(seed)
     if isinstance(env, FuncEnv):
         spaces = compiled_loop.check_functional(env)
-        agent = make_agent(spaces.num_features, spaces.num_actions, config, seed)
+        agent = make_agent(spaces.num_features, spaces.num_actions, config, agent_seed)
         # A callback may change the agent between episodes, and sees it as it then is.
-        episodes = compiled_loop.episodes(env, spaces, agent, config, episodes_per_call=1 if callbacks else 100)
+        episodes_per_call = 1 if callbacks else min(100, checkpoint_every)
+        episodes = compiled_loop.episodes(env, spaces, agent, config, episodes_per_call)
     else:
         checked_env = CheckedEnv(env)
-        agent = make_agent(checked_env.spaces.num_features, checked_env.spaces.num_actions, config, seed)
+        agent = make_agent(checked_env.spaces.num_features, checked_env.spaces.num_actions, config, agent_seed)
         episodes = gymnasium_loop.episodes(checked_env, agent, config)
-    solved_at = None
+    checkpoints = None
+    if checkpoint is not None:
+        checkpoints = Checkpoints(checkpoint, env, config)
+        _start_or_resume(checkpoints, agent, seed, resume, verbose)
 
-    recent: deque[float] = deque(maxlen=max(100, config.solved_window))
+    saved_at = len(agent.episodes)
+    is_over, interrupted = _is_solved(agent.episodes, config), False  # a resumed run may be solved already
     if callbacks:
         episodes = _with_callbacks(episodes, agent, config, callbacks)
-    with contextlib.closing(episodes) as played:
-        for episode in played:
-            recent.append(episode.reward)
+    with contextlib.closing(episodes) as played, stop_requests() as is_asked_to_stop:
+        while not is_over and (episode := next(played, None)):
             if verbose and episode.number % 100 == 0:
-                average = round(float(np.mean(list(recent)[-100:])), 2)
+                last = [e.reward for e in agent.episodes[max(0, episode.number - 99) : episode.number + 1]]
+                average = round(float(np.mean(last)), 2)
                 print(f"Episode {episode.number}, Reward: {episode.reward}, Last 100 Average: {average}")
-            average = float(np.mean(list(recent)[-config.solved_window :]))
-            # The original also takes the mean of fewer episodes, so that one lucky first episode could stop it.
-            if len(recent) >= config.solved_window and average > config.solved_reward:
-                solved_at = episode.number
-                if verbose:
-                    print(f"Solved with {round(average, 2)} reward in {episode.number} episodes!")
-                break
+            if len(agent.episodes) > episode.number + 1:
+                continue  # compiled episodes: the agent is already further
+            is_over = _is_solved(agent.episodes, config) or len(agent.episodes) == config.num_episodes
+            if not is_over and is_asked_to_stop():
+                is_over = interrupted = True
+            if checkpoints and (is_over or len(agent.episodes) >= saved_at + checkpoint_every):
+                _save_or_warn(checkpoints, agent)
+                saved_at = len(agent.episodes)
 
-    if not agent.num_updates:
+    run = Run(config, agent, interrupted)
+    if checkpoints and len(agent.episodes) > saved_at:
+        _save_or_warn(checkpoints, agent)
+    if verbose and run.solved_at is not None:
+        average = round(float(np.mean(run.rewards[-config.solved_window :])), 2)
+        print(f"Solved with {average} reward in {run.solved_at} episodes!")
+    if verbose and interrupted:
+        how = ", and goes on with resume=True" if checkpoints else ""
+        print(f"Interrupted: the run has {len(agent.episodes)} episodes{how}")
+    if not agent.num_updates and not interrupted:
         warnings.warn(
             f"train ended without an update: the memory holds {len(agent.memory)} transitions, "
             f"batch_size is {config.batch_size}",
             stacklevel=2,
         )
-    return Run(config, agent, solved_at)
+    return run
+
+
+def _is_solved(episodes: Sequence[Episode], config: Config) -> bool:
+    """The stop rule, at the end of the last episode.
+
+    The original also takes the mean of fewer episodes than the window, so that one lucky first episode could stop it.
+    """
+    last = [episode.reward for episode in episodes[-config.solved_window :]]
+    return len(last) == config.solved_window and float(np.mean(last)) > config.solved_reward
+
+
+def _start_or_resume(checkpoints: Checkpoints, agent: Agent, seed: int | None, resume: bool, verbose: int) -> None:
+    """Bring the agent to where the run is, and have a checkpoint there before any work starts."""
+    if not resume and (paths := checkpoints.paths()):
+        raise ValueError(
+            f"checkpoint {paths[0]} is there already; resume=True goes on from it, another folder starts anew"
+        )
+    path = checkpoints.restore(agent, seed) if resume else None
+    if path is None:
+        checkpoints.save(agent)
+    if verbose and resume:
+        print(f"Resumed at episode {len(agent.episodes)} from {path}" if path else "Nothing to resume: starting anew")
+
+
+def _save_or_warn(checkpoints: Checkpoints, agent: Agent) -> None:
+    try:
+        checkpoints.save(agent)
+    except OSError as error:
+        warnings.warn(
+            f"checkpoint after episode {len(agent.episodes) - 1} could not be saved ({error}); "
+            "the last one stays, and the run goes on",
+            stacklevel=3,
+        )
 
 
 def _with_callbacks(

@@ -1,4 +1,5 @@
 import gymnasium as gym
+import keras
 import numpy as np
 import psutil
 import pytest
@@ -229,8 +230,35 @@ def test_any_functional_environment_trains():
 def test_a_bad_number_stops_the_run_and_says_where(bad):
     for count, where in [(7.0, "step 6"), (0.0, "at the reset")]:
         env = Counter({"bad": float(bad), "bad_count": count})
-        with pytest.raises(ValueError, match=rf"env Counter: .* was not finite in episode 0, {where}"):
+        with pytest.raises(ValueError, match=rf"env Counter: an observation was not finite in episode 0, {where}"):
             train(env, Config(num_episodes=20), seed=0, verbose=0)
+
+
+class Paying(Counter):
+    """Its fourth reward is too large for float32."""
+
+    def reward(self, state, action, next_state, rng, params=None):
+        return tf.where(next_state["count"] == 4, tf.constant(1e39, tf.float64), 1.0)
+
+
+def test_a_bad_reward_is_told_from_a_bad_observation():
+    with pytest.raises(ValueError, match=r"^env Paying: a reward was not finite in episode 0, step 3"):
+        train(Paying(), Config(num_episodes=20), seed=0, verbose=0)
+
+
+class SpoiledVelocity(keras.callbacks.Callback):
+    """Makes one weight NaN at the next update, whose loss is finite still."""
+
+    def on_epoch_begin(self, epoch, logs=None):
+        if epoch == 12:
+            velocity = self.model.optimizer.variables[3]
+            velocity.assign(np.where(np.arange(velocity.shape[1]) == 5, np.nan, velocity.numpy()))
+
+
+@pytest.mark.parametrize("make_env", [CartPole, lambda: gym.make("CartPole-v1")])
+def test_a_weight_that_becomes_nan_stops_the_run_in_the_same_update(make_env):
+    with pytest.raises(ValueError, match=r"the loss or a weight (was|is) not finite in episode 12, step 0"):
+        train(make_env(), Config(num_episodes=20), seed=0, verbose=0, callbacks=[SpoiledVelocity()])
 
 
 class Noisy(Counter):

@@ -61,6 +61,17 @@ def test_an_unsupported_space_is_named_with_what_is_supported(field, space):
         CheckedEnv(Corridor(**{field: space}))
 
 
+def test_an_error_of_the_environments_own_says_where():
+    def reward(t):
+        if t == 3:
+            raise RuntimeError("the simulator died")
+        return 1.0
+
+    with pytest.raises(RuntimeError, match="the simulator died") as caught:
+        train(Corridor(length=9, reward=reward), seed=0, verbose=0)
+    assert caught.value.__notes__ == ["raised by env Corridor in episode 0, step 3"]
+
+
 def test_what_is_no_environment_is_refused():
     for thing in ("CartPole-v1", None, gym.make_vec("CartPole-v1", num_envs=2)):
         with pytest.raises(TypeError, match=r"^env must be a gymnasium\.Env, got"):

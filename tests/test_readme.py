@@ -8,9 +8,13 @@ README = (ROOT / "README.md").read_text()
 
 
 @pytest.mark.parametrize(
-    "script", re.findall(r"```python\n(.*?)```", README, re.DOTALL), ids=["train", "compiled", "own env", "learn"]
+    "script",
+    re.findall(r"```python\n(.*?)```", README, re.DOTALL),
+    ids=["train", "compiled", "own env", "resume", "study", "learn"],
 )
-def test_the_readmes_scripts_run(script):
+def test_the_readmes_scripts_run(script, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "Agg")
     exec(compile(script, "README.md", "exec"), {})
 
 

@@ -1,0 +1,173 @@
+"""Nothing lost, nothing silent: training killed, stopped, starved and lied to, at full size.
+
+    python -m benchmarks.reliability [--kills 120] > results/reliability.md
+
+What it does is in tests/faults.py and tests/test_config.py; `make test` does the same at a small size. Linux only.
+"""
+
+import argparse
+import collections
+import platform
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import keras
+import numpy as np
+import tensorflow as tf
+from hypothesis import HealthCheck, given, settings
+
+from dqn_keras import Config, compiled_loop, train
+from dqn_keras.agent import make_agent
+from dqn_keras.checkpoint import Checkpoints
+from dqn_keras.environment import CheckedEnv
+from dqn_keras.environments import CartPole
+from dqn_keras.programs import _programs
+from tests import faults
+from tests.test_config import bad_fields, refused
+
+
+def bad_configs(number: int) -> dict[str, Any]:
+    """Refuse so many: each must be an error whose first word is the field, with the value in it."""
+    tried: collections.Counter[str] = collections.Counter()
+
+    @settings(max_examples=number, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+    @given(bad_fields)
+    def refuse(field: tuple[str, Any]) -> None:
+        tried[field[0]] += 1
+        refused(*field)
+
+    refuse()
+    return {"bad Configs": sum(tried.values()), "fields": len(tried), "not refused by name": 0}
+
+
+def forgotten() -> dict[str, int]:
+    figures = collections.Counter()
+    for loop in faults.LOOPS:
+        with tempfile.TemporaryDirectory() as folder:
+            for name, (missing, reset) in faults.forgetting_campaign(loop, folder).items():
+                figures["parts dropped or reset"] += 2
+                is_noticed = missing == "refused" and (reset in ("refused", "other bits") or name == "versions")
+                figures["not noticed"] += not is_noticed
+    return dict(figures)
+
+
+def cost_of_checks() -> dict[str, str]:
+    """What the checks of every word of the environment take of an env step of training, in the Gymnasium loop."""
+    env = gym.make("CartPole-v1")
+    checked = CheckedEnv(env)
+
+    def microseconds(step: Callable, reset: Callable) -> float:
+        best = np.inf
+        for _ in range(200):
+            reset()
+            start = time.perf_counter()
+            for k in range(8):
+                step(k % 2)
+            best = min(best, (time.perf_counter() - start) / 8 * 1e6)
+        return best
+
+    def unchecked(a: int) -> None:
+        state, reward, terminated, truncated, _ = env.step(a)
+        return np.array(state, np.float32), reward, terminated, truncated
+
+    bare = microseconds(unchecked, lambda: env.reset(seed=0))
+    with_checks = microseconds(checked.step, lambda: checked.reset(0, 0))
+    config = Config(num_episodes=300, solved_reward=1e6)
+    for _ in range(2):  # the second has nothing to compile
+        start = time.perf_counter()
+        run = train(env, config, 0, verbose=0)
+        whole = (time.perf_counter() - start) / run.agent.memory.num_appended * 1e6
+    seconds = []
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoints = Checkpoints(folder, env, config)
+        for _ in range(20):
+            start = time.perf_counter()
+            checkpoints.save(run.agent)
+            seconds.append(time.perf_counter() - start)
+        size = checkpoints.paths()[0].stat().st_size
+    return {
+        "checks of an env step": f"{with_checks - bare:.1f} us of {whole:.0f} ({(with_checks - bare) / whole:.1%})",
+        "a checkpoint": f"{np.median(seconds) * 1e3:.0f} ms, {size / 1e6:.1f} MB",
+    }
+
+
+def cost_of_compiled_checks(rounds: int = 30) -> dict[str, str]:
+    """The same for compiled episodes: their program with and without the checks, in turn."""
+    checks, config = compiled_loop.is_all_finite, Config(num_episodes=10**6, epsilon=0.1, solved_reward=1e6)
+    loops = []
+    for is_all_finite in (checks, lambda *_: tf.constant(True)):
+        compiled_loop.is_all_finite = is_all_finite
+        _programs.clear()
+        agent = make_agent(4, 2, config, 0)
+        loop = compiled_loop.episodes(CartPole(), compiled_loop.check_functional(CartPole()), agent, config)
+        while agent.memory.num_appended < 60_000:
+            next(loop)
+        loops.append((agent, loop))
+    compiled_loop.is_all_finite = checks
+    costs = []
+    for _ in range(rounds):
+        turns = []
+        for agent, loop in loops:
+            steps, updates, start = agent.memory.num_appended, agent.num_updates, time.perf_counter()
+            while agent.memory.num_appended < steps + 20_000:
+                next(loop)
+            turns.append((time.perf_counter() - start) / (agent.num_updates - updates) * 1e6)
+        costs.append(turns)
+    with_checks, without = np.min(costs, axis=0)
+    share = np.median([a / b for a, b in costs]) - 1
+    return {"checks of a turn": f"{with_checks:.1f} us with them, {without:.1f} without (best); {share:.1%} (median)"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=120, help="SIGKILLs, a quarter of them inside a save (120)")
+    parser.add_argument("--signals", type=int, default=24, help="SIGINTs and SIGTERMs (24)")
+    parser.add_argument("--corruptions", type=int, default=5_000, help="corrupted checkpoints (5,000)")
+    parser.add_argument("--configs", type=int, default=2_000, help="bad Configs (2,000)")
+    arguments = parser.parse_args()
+    versions = f"tensorflow {tf.__version__}, keras {keras.__version__}, gymnasium {gym.__version__}"
+    print("# Nothing lost, nothing silent\n")
+    print(f"`python -m benchmarks.reliability --kills {arguments.kills} --signals {arguments.signals}`")
+    print(f"`--corruptions {arguments.corruptions} --configs {arguments.configs}` (Python {platform.python_version()},")
+    print(f"{versions}, numpy {np.__version__}). Every figure that should be 0 is in bold.\n")
+    print("| what | figures |\n|---|---|")
+
+    def in_folder(campaign: Callable, *numbers: int) -> Callable[[], dict[str, Any]]:
+        def run() -> dict[str, Any]:
+            with tempfile.TemporaryDirectory() as folder:
+                return campaign(folder, *numbers)
+
+        return run
+
+    for what, campaign in {
+        "SIGKILL at random times and inside saves, resumed each time; a run differs if a bit of its last checkpoint "
+        "does (weights, target, Adam, memory, random state, rewards, counters) or a file is left over": in_folder(
+            faults.kill_campaign, arguments.kills, arguments.kills // 4
+        ),
+        "SIGINT and SIGTERM at random times, then resumed": in_folder(faults.signal_campaign, arguments.signals),
+        "each array and fact of a checkpoint taken out, then put back to its start, both loops": forgotten,
+        "the newest checkpoint corrupted; silent is what was loaded, not told, or not replaced by the older one": (
+            in_folder(faults.corruption_campaign, arguments.corruptions)
+        ),
+        "Config with a bad field": lambda: bad_configs(arguments.configs),
+        "cost, Gymnasium loop on CartPole-v1": cost_of_checks,
+        "cost, compiled episodes": cost_of_compiled_checks,
+    }.items():
+        start = time.perf_counter()
+        figures = campaign()
+        bad = ("differing runs", "not noticed", "silent", "not refused by name")
+        cells = []
+        for name, value in figures.items():
+            if isinstance(value, dict):
+                value = ", ".join(f"{v:,} {k}" for k, v in sorted(value.items()))
+            elif isinstance(value, list):
+                value = len(value)
+            cells.append(f"{name}: **{value}**" if name in bad else f"{name}: {value}")
+        print(f"| {what} | {'; '.join(cells)}; {time.perf_counter() - start:.0f} s |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,309 @@
+"""What is kept on disk: the whole state of a run, and the trained network alone.
+
+A checkpoint is a NumPy archive (.npz, arrays only, nothing is pickled) followed by the SHA-256 of its bytes. It is
+written under another name, flushed to the disk, and only then given its own, so that a crash leaves the last one whole.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import io
+import json
+import os
+import platform
+import re
+import warnings
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import keras
+import numpy as np
+import tensorflow as tf
+from gymnasium.experimental.functional import FuncEnv
+
+from dqn_keras.agent import Agent, Episode
+from dqn_keras.config import Config
+from dqn_keras.networks import check_network
+from dqn_keras.version import __version__
+
+FORMAT = 1
+
+
+class Checkpoints:
+    """The checkpoints of one run in a folder of their own, one file each, of which the last two are kept."""
+
+    def __init__(self, folder: str | os.PathLike, env: gym.Env | FuncEnv, config: Config) -> None:
+        self.folder = Path(folder)
+        self._identity = identity(env, config)
+
+    def paths(self) -> list[Path]:
+        """The files, the newest first."""
+        return sorted(self.folder.glob(f"checkpoint-{'[0-9]' * 10}.npz"), reverse=True)
+
+    def save(self, agent: Agent) -> None:
+        """Save the state of `agent`, which must be at an episode's end; OSError if the disk does not take it."""
+        path = self.folder / f"checkpoint-{len(agent.episodes):010d}.npz"
+        content = to_bytes(_arrays(agent), {"format": FORMAT, **self._identity, **_facts(agent)})
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
+        older = [other for other in self.paths() if other.name < path.name]
+        for other in {*self.paths(), *self.folder.glob(".*.partial.npz")} - {path, *older[:1]}:
+            with contextlib.suppress(OSError):
+                other.unlink()
+
+    def restore(self, agent: Agent, seed: int | None) -> Path | None:
+        """Put `agent` into the newest state that is whole; None if there is none yet.
+
+        Raises:
+            ValueError: the state is of another run (the message begins with what differs, such as a field of Config),
+                or no file is whole.
+        """
+        damaged = []
+        for path in self.paths():
+            try:
+                arrays, facts = from_bytes(path.read_bytes())
+                check_facts(facts, self._identity | _facts(agent))
+                changeable = ["num_episodes"] if seed is not None else ["num_episodes", "seed"]
+                check_is_same(path, facts, {**self._identity, "seed": seed}, but_for=changeable)
+                _restore(agent, arrays, facts)
+            except (DamagedError, OSError) as error:
+                damaged.append(f"{path} cannot be used: {error}")
+                continue
+            num_episodes = self._identity["config"]["num_episodes"]
+            if num_episodes < len(agent.episodes):
+                raise ValueError(
+                    f"num_episodes must be at least {len(agent.episodes)}, as many as {path} has, got {num_episodes}"
+                )
+            if damaged:
+                warnings.warn(f"{'; '.join(damaged)}. The run goes on from the older {path}", stacklevel=4)
+            warn_of_other_versions(path, facts, self._identity, stacklevel=5)
+            return path
+        if damaged:
+            raise ValueError(f"checkpoint: {'; '.join(damaged)}")
+        return None
+
+
+def identity(env: gym.Env | FuncEnv, config: Config) -> dict[str, Any]:
+    """What must be the same for a saved state to be gone on from, as a file holds it (versions may differ)."""
+    facts = {"config": dataclasses.asdict(config), "environment": _describe(env), "versions": _versions()}
+    return json.loads(json.dumps(facts))  # tuples become lists
+
+
+def check_is_same(path: Path, theirs: dict[str, Any], ours: dict[str, Any], but_for: Sequence[str] = ()) -> None:
+    """ValueError that begins with the field of Config, `env` or `seed` in which `path` is of another run."""
+    theirs, ours = ({**x["config"], "env": x["environment"], "seed": x.get("seed")} for x in (theirs, ours))
+    for name in [name for name in ours if name not in but_for]:
+        if name not in theirs or theirs[name] != ours[name]:
+            raise ValueError(f"{name} is {theirs.get(name)!r} in {path}, got {ours[name]!r}")
+
+
+def warn_of_other_versions(path: Path, theirs: dict[str, Any], ours: dict[str, Any], stacklevel: int) -> None:
+    """One warning of all versions that differ."""
+    theirs, ours = theirs["versions"], ours["versions"]
+    others = [f"{name} {theirs.get(name)} (here {ours[name]})" for name in ours if theirs.get(name) != ours[name]]
+    if others:
+        warnings.warn(
+            f"{path} was saved with {', '.join(others)}: what is added may differ in its last bits",
+            stacklevel=stacklevel,
+        )
+
+
+class DamagedError(ValueError):
+    """Why a file is no whole checkpoint."""
+
+
+def to_bytes(arrays: Mapping[str, Any], facts: dict[str, Any]) -> bytes:
+    """The content of a checkpoint file."""
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
+    body = file.getvalue()
+    return body + hashlib.sha256(body).digest()
+
+
+def from_bytes(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The opposite of `to_bytes`; an error that says why, if the content is not as that made it."""
+    body, digest = content[:-32], content[-32:]
+    if hashlib.sha256(body).digest() != digest:
+        raise DamagedError("its SHA-256 is not that of its content, so that it has been cut short or changed")
+    try:
+        with np.load(io.BytesIO(body), allow_pickle=False) as archive:
+            arrays = dict(archive)
+        facts = json.loads(arrays.pop("facts").tobytes())
+        file_format = facts["format"]
+    except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:
+        raise DamagedError(f"it is not a checkpoint ({error})") from None
+    if file_format != FORMAT:
+        raise DamagedError(f"its format is {file_format!r}, and dqn_keras {__version__} reads {FORMAT}")
+    return arrays, facts
+
+
+def _arrays(agent: Agent) -> dict[str, Any]:
+    """All that is an array, by name."""
+    columns = zip(*(episode[1:] for episode in agent.episodes), strict=True) if agent.episodes else [()] * 4
+    arrays = {f"episodes/{name}": np.array(x, t) for (name, t), x in zip(_COLUMNS.items(), columns, strict=True)}
+    arrays["memory"] = agent.memory.rows[: len(agent.memory)]
+    return {**arrays, **{v.path: v.numpy() for v in agent.learner.variables}}
+
+
+_COLUMNS: dict[str, Any] = {"reward": np.float64, "steps": np.int64, "epsilon": np.float64, "loss": np.float64}
+
+
+def _facts(agent: Agent) -> dict[str, Any]:
+    """All that is not."""
+    return {
+        "seed": agent.seed,
+        "num_episodes": len(agent.episodes),
+        "num_appended": agent.memory.num_appended,
+        "num_updates": agent.num_updates,
+        "epsilon": agent.epsilon,
+        "rng": agent.rng.bit_generator.state,
+    }
+
+
+def check_facts(facts: dict[str, Any], expected: dict[str, Any]) -> None:
+    """They must be all there, and of the right kind."""
+    for name, value in expected.items():
+        if type(facts.get(name)) is not type(value):
+            raise DamagedError(f"{name} is missing or wrong in it: {facts.get(name)!r}")
+
+
+def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
+    """Put a fresh agent into a saved state; nothing is changed if the state does not fit it."""
+    num_episodes, num_appended, epsilon = facts["num_episodes"], facts["num_appended"], facts["epsilon"]
+    rng = np.random.default_rng(0)
+    try:
+        rng.bit_generator.state = facts["rng"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DamagedError(f"rng is wrong in it: {error!r}") from None
+    expected = _arrays(agent)
+    expected |= {f"episodes/{name}": np.zeros(max(0, num_episodes), dtype) for name, dtype in _COLUMNS.items()}
+    expected["memory"] = agent.memory.rows[:num_appended]
+    if names := sorted(expected.keys() ^ arrays.keys()):
+        raise DamagedError(f"its arrays are not an agent's: {', '.join(names)} missing or too many")
+    for name, array in arrays.items():
+        wanted = expected[name]
+        if (array.shape, array.dtype) != (wanted.shape, wanted.dtype):
+            raise DamagedError(
+                f"{name} has shape {array.shape} and dtype {array.dtype}, not {wanted.shape} and {wanted.dtype}"
+            )
+        if name != "episodes/loss" and not np.isfinite(array).all():
+            raise DamagedError(f"{name} holds a number that is not finite")
+    if arrays["episodes/steps"].sum() != num_appended or not 0 <= epsilon <= 1:
+        raise DamagedError("its counts do not belong together")
+
+    columns = (arrays[f"episodes/{name}"].tolist() for name in _COLUMNS)
+    agent.episodes[:] = [Episode(k, *values) for k, values in enumerate(zip(*columns, strict=True))]
+    agent.memory.rows[: len(arrays["memory"])] = arrays["memory"]
+    agent.memory.num_appended, agent.num_updates = num_appended, facts["num_updates"]
+    agent.seed, agent.epsilon, agent.rng = facts["seed"], epsilon, rng
+    for variable in agent.learner.variables:
+        variable.assign(arrays[variable.path])
+
+
+def _describe(env: gym.Env | FuncEnv) -> dict[str, Any]:
+    """What makes it this environment; `render_mode` does not."""
+    if isinstance(env, FuncEnv):
+        name, arguments = f"{type(env).__name__} (functional)", vars(env)
+    elif env.spec:
+        name, arguments = env.spec.id, {**env.spec.kwargs, "max_episode_steps": env.spec.max_episode_steps}
+    else:
+        name, arguments = type(env.unwrapped).__name__, {}
+    plain = (bool, int, float, str, type(None))
+    return {
+        "name": name,
+        "arguments": {
+            key: value if isinstance(value, plain) else type(value).__name__
+            for key, value in sorted(arguments.items())
+            if key != "render_mode"
+        },
+        "observation_space": str(env.observation_space),
+        "action_space": str(env.action_space),
+    }
+
+
+def _versions() -> dict[str, str]:
+    """What the last bits of a result may depend on."""
+    modules = {"tensorflow": tf, "keras": keras, "numpy": np, "gymnasium": gym}
+    versions = {name: module.__version__ for name, module in modules.items()}
+    return {"dqn_keras": __version__, "python": platform.python_version(), **versions, "processor": _processor()}
+
+
+def _processor() -> str:
+    """Its kind, with the vector instructions where the system tells them."""
+    try:
+        flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        flags = None
+    vector = sorted(x for x in flags[1].split() if x.startswith(("sse4", "avx", "fma", "amx"))) if flags else []
+    return " ".join([platform.machine(), *vector])
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary file beside `path`, which takes its place at once when the block has ended without an error."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield temporary
+        _flush(temporary)
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+    if os.name == "posix":
+        _flush(path.parent)
+
+
+def _flush(path: Path) -> None:
+    """Wait until the file, or the folder's list of names, is on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def save_agent(path: str | os.PathLike, q_network: keras.Model) -> None:
+    """Save the network alone, in Keras' own format; an older file of that name is replaced at once.
+
+    Raises:
+        ValueError: `path` does not end in .keras.
+        OSError: the disk does not take it.
+    """
+    path = Path(path)
+    if path.suffix != ".keras":
+        raise ValueError(f"path must end in .keras, got {str(path)!r}")
+    network = type(q_network).from_config(q_network.get_config())  # which has no optimizer to save
+    network.set_weights(q_network.get_weights())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        network.save(temporary)
+
+
+def load_agent(path: str | os.PathLike) -> keras.Model:
+    """The network that `run.save` saved, for `evaluate`, or whatever a Keras model is good for.
+
+    It is Keras' own format, in Keras' safe mode: a file that would run code of its own is refused.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is damaged or not a Q-network; the message names the file.
+    """
+    path = Path(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if (broken := archive.testzip()) is not None:  # Keras reads parts, and so checks no sum
+                raise ValueError(f"{broken} in it is damaged")
+        network = keras.saving.load_model(path, compile=False, safe_mode=True)
+        check_network("it", network)
+        if not all(np.isfinite(w).all() for w in network.get_weights()):
+            raise ValueError("one of its weights is not finite")
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # whatever Keras, h5py or zipfile say of bytes that are not theirs
+        raise ValueError(f"path {path} is not a network that can be loaded: {error}") from error
+    return network

@@ -1,0 +1,332 @@
+"""Many seeds of one run: how reliable is it? One seed is an anecdote."""
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import os
+import time
+import warnings
+from collections.abc import Generator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+import tensorflow as tf
+from gymnasium.experimental.functional import FuncEnv
+from joblib import Parallel, delayed, parallel_config
+from scipy import stats
+from tqdm import TqdmWarning
+
+from dqn_keras.agent import recycle
+from dqn_keras.checkpoint import (
+    FORMAT,
+    check_is_same,
+    from_bytes,
+    identity,
+    replacing,
+    to_bytes,
+    warn_of_other_versions,
+)
+from dqn_keras.config import Config, count
+from dqn_keras.interruption import stop_requests
+from dqn_keras.training import train
+
+with warnings.catch_warnings(action="ignore", category=TqdmWarning):  # without ipywidgets a notebook's bar is text
+    from tqdm.auto import tqdm
+
+
+class Outcome(NamedTuple):
+    """What came of one seed."""
+
+    seed: int
+    rewards: np.ndarray
+    """[num_episodes] float64, as `Run.rewards`."""
+    steps: np.ndarray
+    """[num_episodes] int64, environment steps of each episode."""
+    solved_at: int | None
+    """As `Run.solved_at`."""
+    digest: bytes
+    """SHA-256 of the final weights of both networks: equal for equal bits."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Study:
+    """What came of `study`: arrays with one entry for each seed."""
+
+    config: Config
+    outcomes: list[Outcome]
+    """One per seed, in the order asked for; seeds that were interrupted are not among them."""
+
+    @property
+    def seeds(self) -> np.ndarray:
+        """[S] int64."""
+        return np.array([outcome.seed for outcome in self.outcomes], np.int64)
+
+    @functools.cached_property
+    def rewards(self) -> np.ndarray:
+        """[S, num_episodes] float64: each episode's reward; NaN after a run's last."""
+        longest = max((len(outcome.rewards) for outcome in self.outcomes), default=0)
+        rewards = np.full((len(self.outcomes), longest), np.nan)
+        for row, outcome in zip(rewards, self.outcomes, strict=True):
+            row[: len(outcome.rewards)] = outcome.rewards
+        return rewards
+
+    @property
+    def solved_at(self) -> np.ndarray:
+        """[S] float64: the episode at whose end the stop rule held; NaN where it never did."""
+        return np.array([np.nan if o.solved_at is None else o.solved_at for o in self.outcomes], np.float64)
+
+    @property
+    def episodes_to_solved(self) -> np.ndarray:
+        """[S] float64: the same, with `config.num_episodes` where it never did."""
+        return np.nan_to_num(self.solved_at, nan=self.config.num_episodes)
+
+    @property
+    def num_env_steps(self) -> int:
+        """Environment steps of all seeds together."""
+        return int(sum(outcome.steps.sum() for outcome in self.outcomes))
+
+    def __repr__(self) -> str:
+        return f"<Study: {len(self.outcomes)} seeds, {np.isfinite(self.solved_at).sum()} solved>"
+
+
+def study(
+    env: gym.Env | FuncEnv,
+    config: Config = Config(),
+    seeds: Sequence[int] = range(100),
+    *,
+    file: str | os.PathLike | None = None,
+    engine: str = "joblib",
+    num_workers: int | None = None,
+    verbose: int = 1,
+) -> Study:
+    """Train one agent for each seed, several at once; each is the very run that `train(env, config, seed)` gives.
+
+    Args:
+        env: as for `train`. Each worker process makes its own: a registered environment from its spec, any other
+            from a pickled copy.
+        config: the parameters of every run.
+        seeds: whole numbers, each once.
+        file: where to keep what is finished. The same study again does only what is missing; Ctrl-C, or a crash,
+            loses what has not been finished.
+        engine: "joblib", processes on this machine; or "ray", tasks on the Ray cluster that this process is connected
+            to, or else on this machine (needs the extra `ray`); a task whose worker dies is tried again.
+        num_workers: processes of joblib; by default as many as there are cores. With 1 all is done in this process.
+        verbose: 1 shows a progress bar, 0 nothing.
+
+    Raises:
+        TypeError, ValueError: as for `train`; or `file` is of another study (the message begins with what differs).
+    """
+    seeds = [count("seeds", seed, at_least=0) for seed in seeds]
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"seeds must name each seed once, got {seeds}")
+    if engine not in _ENGINES:
+        raise ValueError(f"engine must be one of {', '.join(_ENGINES)}, got {engine!r}")
+    num_workers = len(os.sched_getaffinity(0)) if num_workers is None else count("num_workers", num_workers)
+    facts = {"format": FORMAT, **identity(env, config)}
+    outcomes = {} if file is None else _load(Path(file), facts)
+
+    missing = [seed for seed in seeds if seed not in outcomes]
+    bar = tqdm(total=len(seeds), initial=len(seeds) - len(missing), unit="seed", disable=not verbose)
+    saved_at, was_asked = time.monotonic(), False
+    recipe = cloudpickle.dumps(env.spec if isinstance(env, gym.Env) and env.spec else env)
+    results = _ENGINES[engine](recipe, config, missing, num_workers)
+    with bar, contextlib.closing(results), stop_requests() as is_asked_to_stop:
+        try:
+            for outcome in results if missing else ():
+                if outcome is not None:
+                    outcomes[outcome.seed] = outcome
+                    bar.update()
+                if file is not None and time.monotonic() > saved_at + _SECONDS_BETWEEN_SAVES:
+                    _save(Path(file), outcomes, facts)
+                    saved_at = time.monotonic()
+                if was_asked := is_asked_to_stop():
+                    break
+        finally:
+            if file is not None and missing:
+                _save(Path(file), outcomes, facts)
+    unfinished = sum(seed not in outcomes for seed in seeds)
+    if unfinished:
+        how = "the study was interrupted" if was_asked else "their runs were interrupted"
+        warnings.warn(f"{unfinished} of {len(seeds)} seeds are not in this study: {how}", stacklevel=2)
+    return Study(config, [outcomes[seed] for seed in seeds if seed in outcomes])
+
+
+_SECONDS_BETWEEN_SAVES = 10
+_Results = Generator[Outcome | None, None, None]
+
+
+def _train_seed(recipe: bytes, config: Config, seed: int) -> Outcome | None:
+    """One agent, in whatever process; None if it was interrupted there."""
+    run = train(_env(recipe), config, seed, verbose=0)
+    if run.interrupted:
+        return None
+    weights = [*run.q_network.get_weights(), *run.q_hat_network.get_weights()]
+    digest = hashlib.sha256(b"".join(w.tobytes() for w in weights)).digest()
+    steps = np.array([episode.steps for episode in run.episodes], np.int64)
+    recycle(run.agent, config)
+    return Outcome(seed, run.rewards, steps, run.solved_at, digest)
+
+
+def _train_seed_in_worker(recipe: bytes, config: Config, seed: int) -> Outcome | None:
+    """The same in a process of its own, where TensorFlow gets one thread: there is a process for each core."""
+    with contextlib.suppress(RuntimeError):  # it has started already, in a worker that someone else has used
+        tf.config.threading.set_intra_op_parallelism_threads(1)
+    return _train_seed(recipe, config, seed)
+
+
+@functools.lru_cache(maxsize=1)
+def _env(recipe: bytes) -> gym.Env | FuncEnv:
+    """The process's own environment, made once, so that its program is compiled once."""
+    env = cloudpickle.loads(recipe)
+    return gym.make(env) if isinstance(env, gym.envs.registration.EnvSpec) else env
+
+
+def _by_joblib(recipe: bytes, config: Config, seeds: list[int], num_workers: int) -> _Results:
+    if num_workers == 1 or len(seeds) == 1:
+        yield from (_train_seed(recipe, config, seed) for seed in seeds)
+        return
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        parallel = Parallel(n_jobs=min(num_workers, len(seeds)), batch_size=1, return_as="generator_unordered")
+        yield from parallel(delayed(_train_seed_in_worker)(recipe, config, seed) for seed in seeds)
+
+
+def _by_ray(recipe: bytes, config: Config, seeds: list[int], _: int) -> _Results:
+    try:
+        import ray
+    except ImportError:
+        raise ImportError('engine="ray" needs the extra `ray`: pip install "dqn_keras[ray]"') from None
+    if not ray.is_initialized():
+        ray.init(include_dashboard=False, log_to_driver=False)
+    task = ray.remote(max_retries=3)(_train_seed_in_worker)
+    waiting = [task.remote(recipe, config, seed) for seed in seeds]
+    try:
+        while waiting:
+            done, waiting = ray.wait(waiting, timeout=1.0)
+            yield from ray.get(done) or [None]  # so that the caller can stop
+    finally:
+        for unfinished in waiting:
+            ray.cancel(unfinished, force=True)
+
+
+_ENGINES = {"joblib": _by_joblib, "ray": _by_ray}
+
+
+def _save(path: Path, outcomes: dict[int, Outcome], facts: dict[str, Any]) -> None:
+    columns = [outcomes[seed] for seed in sorted(outcomes)]
+    arrays = {
+        "seeds": np.array([o.seed for o in columns], np.int64),
+        "num_episodes": np.array([len(o.rewards) for o in columns], np.int64),
+        "solved_at": np.array([-1 if o.solved_at is None else o.solved_at for o in columns], np.int64),
+        "digests": np.array([list(o.digest) for o in columns], np.uint8).reshape(-1, 32),
+        "rewards": np.concatenate([np.zeros(0), *(o.rewards for o in columns)]),
+        "steps": np.concatenate([np.zeros(0, np.int64), *(o.steps for o in columns)]),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        temporary.write_bytes(to_bytes(arrays, facts))
+
+
+def _load(path: Path, facts: dict[str, Any]) -> dict[int, Outcome]:
+    """By seed; none if there is no file yet."""
+    if not path.exists():
+        return {}
+    outcomes, theirs = _read(path)
+    check_is_same(path, theirs, facts)
+    warn_of_other_versions(path, theirs, facts, stacklevel=4)
+    return outcomes
+
+
+def _read(path: Path) -> tuple[dict[int, Outcome], dict[str, Any]]:
+    try:
+        arrays, facts = from_bytes(path.read_bytes())
+        ends = np.cumsum(arrays["num_episodes"])[:-1]
+        columns = zip(
+            arrays["seeds"].tolist(),
+            np.split(arrays["rewards"], ends),
+            np.split(arrays["steps"], ends),
+            [None if k < 0 else k for k in arrays["solved_at"].tolist()],
+            [digest.tobytes() for digest in arrays["digests"]],
+            strict=True,
+        )
+        return {column[0]: Outcome(*column) for column in columns}, facts
+    except (ValueError, KeyError) as error:
+        raise ValueError(f"file {path} is not a study that can be loaded: {error}") from error
+
+
+def load_study(path: str | os.PathLike) -> Study:
+    """The study that `study(..., file=path)` kept, all of its seeds in ascending order."""
+    outcomes, facts = _read(Path(path))
+    fields = {**facts["config"], "hidden_units": tuple(facts["config"]["hidden_units"])}
+    return Study(Config(**fields), list(outcomes.values()))
+
+
+class Estimate(NamedTuple):
+    """A number with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        digits = 1 if abs(self.value) >= 10 else 3
+        return f"{self.value:.{digits}f} ({self.low:.{digits}f} to {self.high:.{digits}f})"
+
+
+class Summary(NamedTuple):
+    """What a study says of its configuration. A seed that was not solved counts with the episodes it had."""
+
+    share_solved: Estimate
+    """Of the seeds, within `num_episodes`; Wilson interval."""
+    median: Estimate
+    """Episodes to solved; bootstrap interval. Not touched by how late the latest are, if most are solved."""
+    interquartile_mean: Estimate
+    """Episodes to solved, mean of the middle half; bootstrap interval."""
+
+
+def summarize(study: Study) -> Summary:
+    """Share of seeds solved, median and interquartile mean of the episodes to solved."""
+    episodes, num_solved = study.episodes_to_solved, int(np.isfinite(study.solved_at).sum())
+    share = stats.binomtest(num_solved, len(episodes)).proportion_ci(method="wilson")
+    return Summary(
+        Estimate(num_solved / len(episodes), float(share.low), float(share.high)),
+        _bootstrap(np.median, episodes),
+        _bootstrap(functools.partial(stats.trim_mean, proportiontocut=0.25), episodes),
+    )
+
+
+class Comparison(NamedTuple):
+    """Of two studies."""
+
+    difference: Estimate
+    """Median episodes to solved of the second minus those of the first."""
+    probability_of_improvement: Estimate
+    """That a run of the second is solved earlier than one of the first; ties count half (Agarwal et al. 2021)."""
+
+
+def compare(first: Study, second: Study) -> Comparison:
+    """How two configurations differ in the episodes they need; bootstrap intervals."""
+    samples = first.episodes_to_solved, second.episodes_to_solved
+    return Comparison(_bootstrap(_difference, *samples), _bootstrap(_probability_of_improvement, *samples))
+
+
+def _difference(first: np.ndarray, second: np.ndarray, axis: int = -1) -> np.ndarray:
+    return np.median(second, axis=axis) - np.median(first, axis=axis)
+
+
+def _probability_of_improvement(first: np.ndarray, second: np.ndarray, axis: int = -1) -> np.ndarray:
+    u = stats.mannwhitneyu(first, second, axis=axis, method="asymptotic").statistic
+    return u / (first.shape[axis] * second.shape[axis])
+
+
+def _bootstrap(statistic: Any, *samples: np.ndarray) -> Estimate:
+    value = float(statistic(*samples))
+    if all(len(np.unique(sample)) == 1 for sample in samples):  # as in a study of one seed: nothing to resample
+        return Estimate(value, np.nan, np.nan)
+    interval = stats.bootstrap(
+        samples, statistic, n_resamples=2_000, method="percentile", rng=np.random.default_rng(0), batch=200
+    ).confidence_interval
+    return Estimate(value, float(interval.low), float(interval.high))

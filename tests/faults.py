@@ -1,0 +1,327 @@
+"""Faults done to training on purpose, by tests at a small size and by `benchmarks.reliability` at the full one."""
+
+import contextlib
+import hashlib
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+
+from dqn_keras import Config, checkpoint, train
+from dqn_keras.agent import make_agent
+from dqn_keras.checkpoint import Checkpoints, from_bytes, to_bytes
+from dqn_keras.environments import CartPole
+
+LOOPS = {"Gymnasium loop": lambda: gym.make("CartPole-v1"), "compiled episodes": CartPole}
+CONFIG = Config(num_episodes=250, batch_size=32, memory_size=2_000, solved_reward=1e6)  # its memory goes round
+SEED, EVERY = 3, 5
+
+
+def play(loop, folder, config=CONFIG, seed=SEED, env=None, resume=True, **arguments):
+    """A run of the campaign, or what is left of it."""
+    env = env or LOOPS[loop]()
+    return train(env, config, seed, checkpoint=folder, checkpoint_every=EVERY, resume=resume, verbose=0, **arguments)
+
+
+def newest(folder):
+    return max(Path(folder).glob("checkpoint-*.npz"))
+
+
+def final_bits(folder):
+    """Of weights, target, Adam, memory, random state, rewards and counters: the digest of the last checkpoint."""
+    return hashlib.sha256(newest(folder).read_bytes()).hexdigest()
+
+
+# Kills. A child process trains; it dies by SIGKILL, from outside at a random time or by its own hand inside a save.
+
+
+def _train_in_child(loop, folder, started, death):
+    started.set()
+    if death is not None:
+        _die_in_save(*death)
+    play(loop, folder)
+
+
+def _die_in_save(num_saves, num_lines, share):
+    """Die in the save after `num_saves`: before its line `num_lines`, or, if there is a share, in mid-write."""
+    saves, save, write_bytes = iter(range(num_saves + 1)), Checkpoints.save, Path.write_bytes
+
+    def tracer(frame, event, _):
+        nonlocal num_lines
+        if frame.f_code.co_filename != checkpoint.__file__:
+            return None
+        if event == "line":
+            num_lines -= 1
+            if num_lines < 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+        return tracer
+
+    def write_a_part(path, content):
+        with path.open("wb") as file:
+            file.write(content[: int(share * len(content))])
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def save_and_die(self, agent):
+        if next(saves) < num_saves:
+            return save(self, agent)
+        if share is not None:
+            Path.write_bytes = write_a_part
+        else:
+            sys.settrace(tracer)
+        save(self, agent)
+        os.kill(os.getpid(), signal.SIGKILL)
+        return None
+
+    Checkpoints.save = save_and_die
+    assert write_bytes is not write_a_part
+
+
+def child_process(target, *arguments):
+    """A process that has imported the package already, and nothing more."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["dqn_keras", "tests.faults"])
+    started = context.Event()
+    process = context.Process(target=target, args=(*arguments[:2], started, *arguments[2:]))
+    process.start()
+    started.wait()
+    return process
+
+
+def kill_campaign(folder, num_kills, num_in_saves, kills_per_run=10, seed=0):
+    """SIGKILL runs of both loops again and again, each time resumed: -> kills done, in saves, runs, differing runs.
+
+    `num_in_saves` of the deaths, or a few more, are inside a save. After each the newest checkpoint must be whole.
+    """
+    rng, folder = random.Random(seed), Path(folder)
+    references, seconds = {}, {}
+    for loop in LOOPS:
+        process = child_process(_train_in_child, loop, folder / f"reference {loop}", None)
+        start = time.perf_counter()
+        process.join()
+        assert process.exitcode == 0
+        seconds[loop] = time.perf_counter() - start
+        references[loop] = final_bits(folder / f"reference {loop}")
+
+    killed = killed_in_saves = runs = differing = attempts = 0
+    while killed < num_kills:
+        loop = list(LOOPS)[runs % 2]
+        run_folder = folder / f"run {runs}"
+        for _ in range(min(kills_per_run, num_kills - killed)):
+            attempts += 1
+            is_in_save = killed_in_saves < num_in_saves and rng.random() < 1.5 * num_in_saves / num_kills
+            is_in_save |= num_kills - killed <= num_in_saves - killed_in_saves
+            death = None
+            if is_in_save:
+                death = (rng.randrange(1, 8), rng.randrange(60), rng.choice([None, rng.random()]))
+            process = child_process(_train_in_child, loop, run_folder, death)
+            if not is_in_save:
+                process.join(rng.uniform(0, seconds[loop]))
+                process.kill()
+            process.join()
+            if process.exitcode == 0:
+                break  # it was done before
+            assert process.exitcode == -signal.SIGKILL, process.exitcode
+            killed, killed_in_saves = killed + 1, killed_in_saves + is_in_save
+            if list(run_folder.glob("checkpoint-*.npz")):
+                from_bytes(newest(run_folder).read_bytes())
+        process = child_process(_train_in_child, loop, run_folder, None)
+        process.join()
+        assert process.exitcode == 0
+        left = sorted(path.name for path in run_folder.iterdir())
+        is_tidy = len(left) == 2 and not any("partial" in name for name in left)
+        differing += final_bits(run_folder) != references[loop] or not is_tidy
+        runs += 1
+        shutil.rmtree(run_folder)
+    return {"kills": killed, "of them inside a save": killed_in_saves, "runs": runs, "differing runs": differing}
+
+
+# Corruption. The newest of two checkpoints is spoilt; what is loaded must be the older one, and that must be said.
+
+
+def spoilt(content, rng):
+    """The bytes of a checkpoint spoilt in one way: -> the way, the new bytes."""
+    way = rng.choice(["bit flip", "bit flip in the zip's directory", "truncation", "tail", "swapped members", "zeros"])
+    spoilt = bytearray(content)
+    if way == "bit flip":
+        spoilt[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+    elif way == "bit flip in the zip's directory":
+        start = content.index(b"PK\x01\x02")
+        spoilt[rng.randrange(start, len(content))] ^= 1 << rng.randrange(8)
+    elif way == "truncation":
+        del spoilt[rng.randrange(len(content)) :]
+    elif way == "tail":
+        spoilt += rng.randbytes(rng.randrange(1, 100))
+    elif way == "swapped members":
+        names = rng.choice([(b"q_network/hidden_1/bias", b"q_hat_network/hidden_1/bias"), (b"momentum", b"velocity")])
+        spoilt = spoilt.replace(names[0], b"\0").replace(names[1], names[0]).replace(b"\0", names[1])
+    else:
+        start = rng.randrange(len(content) - 32)
+        spoilt[start : start + 32] = bytes(32)
+    return way, bytes(spoilt)
+
+
+def forged(content, rng):
+    """A checkpoint made wrong with a right digest: -> the way, the new bytes."""
+    arrays, facts = from_bytes(content)
+    name = rng.choice(sorted(arrays))
+    way = rng.choice(["format", "shape", "dtype", "NaN", "missing array", "array too many", "missing fact", "counts"])
+    if way == "format":
+        facts["format"] += 1
+    elif way == "shape":
+        arrays[name] = np.stack([arrays[name]] * 2)
+    elif way == "dtype":
+        arrays[name] = arrays[name].astype(np.float16 if arrays[name].dtype != np.float16 else np.float64)
+    elif way == "NaN":
+        name = rng.choice(sorted(n for n in arrays if arrays[n].dtype.kind == "f" and n != "episodes/loss"))
+        arrays[name] = arrays[name].copy()
+        arrays[name].reshape(-1)[rng.randrange(arrays[name].size)] = rng.choice([np.nan, np.inf, -np.inf])
+    elif way == "missing array":
+        del arrays[name]
+    elif way == "array too many":
+        arrays["more"] = np.zeros(1)
+    elif way == "missing fact":
+        del facts[rng.choice(sorted(facts.keys()))]
+    else:
+        facts[rng.choice(["num_episodes", "num_appended"])] += rng.choice([-1, 1])
+    return way, to_bytes(arrays, facts)
+
+
+def corruption_campaign(folder, number, seed=0):
+    """-> how often each way was tried, and how often it was not noticed, or not said, or not made good."""
+    rng, folder = random.Random(seed), Path(folder)
+    env, config = CartPole(), CONFIG
+    source = folder / "source"
+    play(None, source, env=env)
+    good, older = newest(source).read_bytes(), min(source.glob("checkpoint-*.npz"))
+    expected = from_bytes(older.read_bytes())[0]
+    tried, silent = {}, []
+    agent = make_agent(4, 2, config, SEED)
+    for _ in range(number):
+        way, content = (spoilt if rng.random() < 0.8 else forged)(good, rng)
+        if content == good:
+            continue  # zeros where there were zeros
+        tried[way] = tried.get(way, 0) + 1
+        newest(source).write_bytes(content)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            path = Checkpoints(source, env, config).restore(agent, SEED)
+        said = [str(w.message) for w in caught]
+        is_told = len(said) == 1 and str(newest(source)) in said[0] and f"goes on from the older {older}" in said[0]
+        restored = checkpoint._arrays(agent)
+        is_older = all(np.array_equal(restored[k], v, equal_nan=True) for k, v in expected.items())
+        if path != older or not is_told or not is_older:
+            silent.append((way, path, said))
+    return {"corruptions": sum(tried.values()), "by way": tried, "silent": silent}
+
+
+# Forgotten fields. Each part of a checkpoint is taken away, or put back to what it is at the start, in turn.
+
+
+def forgetting_campaign(loop, folder):
+    """-> for each part, how a resume shows that it is missing, and that it is reset; '' if it does not."""
+    folder = Path(folder)
+    run = play(loop, folder / "reference")
+    reference = final_bits(folder / "reference")
+    half = Config(**{**vars(CONFIG), "num_episodes": 120})
+    play(loop, folder / "half", config=half)
+    arrays, facts = from_bytes(newest(folder / "half").read_bytes())
+    fresh = make_agent(4, 2, run.config, SEED)
+    start_arrays, start_facts = checkpoint._arrays(fresh), checkpoint._facts(fresh)
+    start_facts["rng"] = np.random.default_rng(0).bit_generator.state
+    start_facts["seed"] = 0
+
+    def outcome(arrays, facts):
+        spoilt_folder = folder / "spoilt"
+        shutil.rmtree(spoilt_folder, ignore_errors=True)
+        spoilt_folder.mkdir()
+        (spoilt_folder / newest(folder / "half").name).write_bytes(to_bytes(arrays, facts))
+        try:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                play(loop, spoilt_folder, seed=None)
+        except ValueError:
+            return "refused"
+        if final_bits(spoilt_folder) != reference:
+            return "other bits"
+        return "warned" if caught else ""
+
+    assert outcome(arrays, facts) == ""
+    outcomes = {}
+    for name, value in arrays.items():
+        others = {k: v for k, v in arrays.items() if k != name}
+        start = start_arrays[name] if start_arrays[name].shape == value.shape else np.zeros_like(value)
+        if np.array_equal(start, value):  # such as the learning rate, which training does not change
+            start = start + np.ones_like(start)
+        outcomes[name] = outcome(others, facts), outcome({**others, name: start}, facts)
+    for name in facts:
+        others = {k: v for k, v in facts.items() if k != name}
+        start = start_facts.get(name, {} if isinstance(facts[name], dict) else 0)
+        outcomes[name] = outcome(arrays, others), outcome(arrays, {**others, name: start})
+    return outcomes
+
+
+# Saves that fail.
+
+
+@contextlib.contextmanager
+def failing(module, name, error, after=0):
+    """From its call number `after` on, a function of a module raises."""
+    original, calls = getattr(module, name), iter(range(10**9))
+
+    def fails(*arguments, **keywords):
+        if next(calls) >= after:
+            raise error
+        return original(*arguments, **keywords)
+
+    setattr(module, name, fails)
+    try:
+        yield
+    finally:
+        setattr(module, name, original)
+
+
+# Signals.
+
+
+def _train_and_report(loop, folder, started, report):
+    started.set()
+    run = play(loop, folder)
+    Path(report).write_text("interrupted" if run.interrupted else "ended")
+
+
+def signal_campaign(folder, number, seed=0):
+    """Ask runs to stop by SIGINT and SIGTERM at random times: -> requests, how many stopped a run, differing runs.
+
+    Those that stop none come when training has ended and its process has not.
+    """
+    rng, folder = random.Random(seed), Path(folder)
+    figures = {"signals": 0, "runs stopped by them": 0, "differing runs": 0}
+    seconds = {}
+    for k in range(number):
+        loop, kind = list(LOOPS)[k % 2], (signal.SIGINT, signal.SIGTERM)[k // 2 % 2]
+        reference, run_folder, report = folder / f"reference {loop}", folder / f"run {k}", folder / f"report {k}"
+        if not reference.exists():
+            process = child_process(_train_in_child, loop, reference, None)
+            start = time.perf_counter()
+            process.join()
+            seconds[loop] = time.perf_counter() - start
+        process = child_process(_train_and_report, loop, run_folder, report)
+        while not list(run_folder.glob("checkpoint-*.npz")):
+            time.sleep(0.01)
+        process.join(rng.uniform(0.2, 0.9 * seconds[loop]))  # compilation and training follow the first checkpoint
+        if process.is_alive():
+            os.kill(process.pid, kind)
+            figures["signals"] += 1
+        process.join()
+        figures["runs stopped by them"] += report.exists() and report.read_text() == "interrupted"
+        play(loop, run_folder)
+        figures["differing runs"] += final_bits(run_folder) != final_bits(reference)
+    return figures

@@ -1,0 +1,389 @@
+import contextlib
+import dataclasses
+import errno
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import warnings
+
+import gymnasium as gym
+import keras
+import numpy as np
+import pytest
+
+from dqn_keras import Config, checkpoint, evaluate, load_agent, make_networks, train
+from dqn_keras.checkpoint import Checkpoints, from_bytes, to_bytes
+from dqn_keras.environments import CartPole
+from tests import faults
+from tests.environments import Corridor
+from tests.faults import CONFIG, LOOPS, SEED, final_bits, newest, play
+from tests.test_training import Tape, fingerprint
+
+QUICK = dataclasses.replace(CONFIG, num_episodes=40)
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_a_run_resumed_three_times_ends_with_the_bits_of_one_that_was_not(loop, tmp_path):
+    whole = train(LOOPS[loop](), QUICK, SEED, verbose=0)
+    for num_episodes in (7, 8, 33, 40):
+        config = dataclasses.replace(QUICK, num_episodes=num_episodes)
+        resumed = play(loop, tmp_path / "resumed", config)
+    assert fingerprint(resumed) == fingerprint(whole)
+    assert repr(resumed.episodes) == repr(whole.episodes)  # some losses are NaN
+    play(loop, tmp_path / "whole", QUICK)
+    assert final_bits(tmp_path / "resumed") == final_bits(tmp_path / "whole")
+
+
+def test_killed_runs_end_with_the_bits_of_one_that_was_not(tmp_path):
+    figures = faults.kill_campaign(tmp_path, num_kills=8, num_in_saves=4, kills_per_run=4)
+    assert figures["kills"] == 8
+    assert figures["of them inside a save"] >= 4
+    assert figures["differing runs"] == 0
+
+
+def test_runs_that_are_asked_to_stop_stop_and_go_on_to_the_same_bits(tmp_path):
+    figures = faults.signal_campaign(tmp_path, 4)
+    assert figures["runs stopped by them"] > 0
+    assert figures["differing runs"] == 0
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_no_part_of_a_checkpoint_can_be_forgotten(loop, tmp_path):
+    outcomes = faults.forgetting_campaign(loop, tmp_path)
+    assert len(outcomes) > 30
+    versions = outcomes.pop("versions")
+    assert versions == ("refused", "warned")  # they change nothing that the run computes
+    assert all(missing == "refused" for missing, _ in outcomes.values()), outcomes
+    assert all(reset in ("refused", "other bits") for _, reset in outcomes.values()), outcomes
+
+
+def test_a_corrupted_checkpoint_gives_way_to_the_older_one_and_that_is_said(tmp_path):
+    figures = faults.corruption_campaign(tmp_path, 300)
+    assert figures["corruptions"] > 250
+    assert len(figures["by way"]) == 14
+    assert figures["silent"] == []
+
+
+def test_if_no_checkpoint_is_whole_the_error_says_why_of_each(tmp_path):
+    play("compiled episodes", tmp_path, QUICK)
+    paths = sorted(tmp_path.iterdir())
+    assert len(paths) == 2
+    for path in paths:
+        path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(ValueError, match=r"^checkpoint: .*0040\.npz cannot be used: its SHA.*\.npz cannot be used"):
+        play("compiled episodes", tmp_path, QUICK)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"config": dataclasses.replace(QUICK, gamma=0.9)}, r"^gamma is 0\.95 in .*, got 0\.9"),
+        ({"config": dataclasses.replace(QUICK, hidden_units=(8,))}, r"^hidden_units is \[64\] in .*, got \[8\]"),
+        ({"config": dataclasses.replace(QUICK, num_episodes=39)}, r"^num_episodes must be at least 40, .*, got 39"),
+        ({"seed": 4}, r"^seed is 3 in .*, got 4"),
+        ({"env": gym.make("CartPole-v1", max_episode_steps=9)}, r"^env is .* 500.*got .*'max_episode_steps': 9"),
+        ({"env": gym.make("CartPole-v1", sutton_barto_reward=True)}, r"^env is .*, got .*'sutton_barto_reward': True"),
+        ({"env": CartPole()}, r"^env is .*, got \{'name': 'CartPole \(functional\)'"),
+        ({"env": gym.make("MountainCar-v0")}, r"^env is .*, got \{'name': 'MountainCar-v0'"),
+        ({"resume": False}, r"^checkpoint .*0040\.npz is there already; resume=True"),
+    ],
+    ids=lambda x: "",
+)
+def test_a_checkpoint_of_another_run_is_refused_by_what_differs(change, message, tmp_path):
+    play("Gymnasium loop", tmp_path, QUICK)
+    before = final_bits(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        play("Gymnasium loop", tmp_path, **{"config": QUICK, **change})
+    assert final_bits(tmp_path) == before
+
+
+def test_how_it_is_rendered_makes_no_other_environment(tmp_path):
+    play("Gymnasium loop", tmp_path, QUICK)
+    env = gym.make("CartPole-v1", render_mode="rgb_array")
+    assert len(play(None, tmp_path, dataclasses.replace(QUICK, num_episodes=41), env=env).episodes) == 41
+
+
+def test_a_run_that_is_over_is_handed_back_as_it_is(tmp_path, capsys):
+    config = Config(num_episodes=60, batch_size=8, solved_reward=3.5)
+    env = Corridor(length=100, limit=4)
+    first = train(env, config, verbose=0, checkpoint=tmp_path)
+    again = train(env, config, checkpoint=tmp_path, resume=True)  # the seed is the checkpoint's
+    assert (again.seed, again.solved_at, fingerprint(again)) == (first.seed, 49, fingerprint(first))
+    assert len(env.actions) == 200
+    assert capsys.readouterr().out.splitlines() == [
+        f"Resumed at episode 50 from {newest(tmp_path)}",
+        "Solved with 4.0 reward in 49 episodes!",
+    ]
+
+
+def test_the_folder_keeps_the_last_two_and_nothing_else(tmp_path):
+    folder = tmp_path / "runs" / "cartpole"
+    folder.mkdir(parents=True)
+    (folder / ".checkpoint-0000000005.99.partial.npz").write_bytes(b"left by a crash")
+    play("Gymnasium loop", folder, QUICK)
+    assert sorted(path.name for path in folder.iterdir()) == ["checkpoint-0000000035.npz", "checkpoint-0000000040.npz"]
+
+
+def test_other_versions_are_one_warning(tmp_path):
+    play("Gymnasium loop", tmp_path, QUICK)
+    arrays, facts = from_bytes(newest(tmp_path).read_bytes())
+    facts["versions"] |= {"keras": "3.0.0", "processor": "x86_64 sse4_1"}
+    newest(tmp_path).write_bytes(to_bytes(arrays, facts))
+    with pytest.warns(
+        UserWarning, match=r"saved with keras 3\.0\.0 \(here .*\), processor x86_64 sse4_1 \(here"
+    ) as caught:
+        play("Gymnasium loop", tmp_path, QUICK)
+    assert len(caught) == 1
+
+
+def test_a_checkpoint_is_arrays_only_and_numpy_reads_it(tmp_path):
+    play("Gymnasium loop", tmp_path, QUICK)
+    with np.load(newest(tmp_path), allow_pickle=False) as archive:
+        assert archive["q_network/hidden_1/kernel"].shape == (4, 64)
+
+
+def test_what_callbacks_change_is_kept(tmp_path):
+    schedule = keras.callbacks.LearningRateScheduler(lambda episode: 0.001 * 0.9**episode)
+    whole = train(gym.make("CartPole-v1"), QUICK, SEED, verbose=0, callbacks=[schedule])
+    tape = Tape(stop_after=20)
+    stopped = play("Gymnasium loop", tmp_path, QUICK, callbacks=[schedule, tape])
+    assert len(stopped.episodes) == 21
+    assert not stopped.interrupted
+    tape = Tape()
+    resumed = play("Gymnasium loop", tmp_path, QUICK, callbacks=[schedule, tape])
+    assert tape.calls[1] == ("begins", 21)
+    assert fingerprint(resumed) == fingerprint(whole)
+
+
+# Saves that fail
+
+
+NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
+FAILURES = {
+    "no space": (os, "fsync", NO_SPACE),
+    "an input/output error": (os, "open", OSError(errno.EIO, "Input/output error")),
+    "no permission": (os, "replace", PermissionError(errno.EACCES, "Permission denied")),
+}
+
+
+@pytest.mark.parametrize(("module", "name", "error"), FAILURES.values(), ids=FAILURES.keys())
+def test_a_save_that_fails_leaves_the_last_checkpoint_and_no_litter(module, name, error, tmp_path):
+    calls = 4 if name == "fsync" else 2  # the first two saves go well
+    with (
+        faults.failing(checkpoint.os, name, error, after=calls if name == "replace" else 4),
+        pytest.warns(
+            UserWarning, match=rf"^checkpoint after episode \d+ could not be saved \(.*{error.strerror}"
+        ) as caught,
+    ):
+        run = play("Gymnasium loop", tmp_path, QUICK)
+    assert len(caught) > 3
+    assert len(run.episodes) == 40
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "checkpoint-0000000000.npz",
+        "checkpoint-0000000005.npz",
+    ]
+    assert fingerprint(play("Gymnasium loop", tmp_path, QUICK)) == fingerprint(run)
+
+
+def test_a_disk_that_is_really_too_small_is_a_warning_too(tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, limits[1]))
+    try:
+        with pytest.warns(UserWarning, match=r"could not be saved \(.*File too large"):
+            run = play("Gymnasium loop", tmp_path, QUICK)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.glob(".*"))
+    assert fingerprint(play("Gymnasium loop", tmp_path, QUICK)) == fingerprint(run)
+
+
+def test_a_folder_that_cannot_be_one_is_an_error_before_any_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    env = Corridor()
+    with pytest.raises(OSError, match="file"):
+        train(env, QUICK, verbose=0, checkpoint=tmp_path / "file" / "runs")
+    assert env.reset_seeds == []
+    with pytest.raises(ValueError, match=r"^resume needs .* checkpoint, got None"):
+        train(env, QUICK, resume=True)
+    with pytest.raises(ValueError, match=r"^checkpoint_every must be"):
+        train(env, QUICK, checkpoint=tmp_path, checkpoint_every=0)
+
+
+def test_a_folder_that_is_removed_on_the_way_is_made_anew(tmp_path):
+    class Remover(keras.callbacks.Callback):
+        def on_epoch_end(self, epoch, logs=None):
+            if epoch == 12:
+                faults.shutil.rmtree(tmp_path / "run")
+
+    run = play("Gymnasium loop", tmp_path / "run", QUICK, callbacks=[Remover()])
+    assert len(list((tmp_path / "run").iterdir())) == 2
+    assert fingerprint(play("Gymnasium loop", tmp_path / "run", QUICK)) == fingerprint(run)
+
+
+def test_an_error_in_the_environment_leaves_the_last_checkpoint(tmp_path):
+    config = dataclasses.replace(QUICK, batch_size=4)
+    broken = Corridor(limit=3, length=100, reward=lambda t: np.nan if len(broken.actions) == 50 else 1.0)
+    with pytest.raises(ValueError, match=r"env Corridor: the reward must be finite.*in episode 16, step 1"):
+        play(None, tmp_path, config, env=broken)
+    assert newest(tmp_path).name == "checkpoint-0000000015.npz"
+    whole = train(Corridor(limit=3, length=100), config, SEED, verbose=0)
+    assert fingerprint(play(None, tmp_path, config, env=Corridor(limit=3, length=100))) == fingerprint(whole)
+
+
+# Being asked to stop
+
+
+class Asking(keras.callbacks.Callback):
+    def __init__(self, *numbers):
+        super().__init__()
+        self.numbers = numbers
+
+    def on_epoch_begin(self, epoch, logs=None):
+        if epoch == 7:
+            for number in self.numbers:
+                signal.raise_signal(number)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("loop", LOOPS)
+def test_a_request_stops_the_run_at_the_end_of_that_episode(loop, number, capsys):
+    handlers = [signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)]
+    run = train(LOOPS[loop](), QUICK, SEED, callbacks=[Asking(number)])
+    assert run.interrupted
+    assert len(run.episodes) == 8
+    assert capsys.readouterr().out.splitlines()[-1] == "Interrupted: the run has 8 episodes"
+    assert [signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
+def test_a_second_ctrl_c_stops_at_once(cartpole):
+    with pytest.raises(KeyboardInterrupt):
+        train(cartpole, QUICK, SEED, verbose=0, callbacks=[Asking(signal.SIGINT, signal.SIGINT)])
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_handlers_of_the_users_own_stay(cartpole):
+    heard = []
+    previous = signal.signal(signal.SIGTERM, lambda *_: heard.append(1))
+    try:
+        run = train(cartpole, QUICK, SEED, verbose=0, callbacks=[Asking(signal.SIGTERM)])
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+    assert heard == [1]
+    assert not run.interrupted
+
+
+def test_training_works_in_a_thread(cartpole):
+    runs = []
+    thread = threading.Thread(target=lambda: runs.append(train(cartpole, QUICK, SEED, verbose=0)))
+    thread.start()
+    thread.join()
+    assert len(runs[0].episodes) == 40
+
+
+def test_an_interrupted_notebook_cell_hands_back_the_run():
+    from jupyter_client.manager import start_new_kernel
+
+    cell = """
+import gymnasium as gym
+from dqn_keras import Config, train
+print("ready")
+run = train(gym.make("CartPole-v1"), Config(num_episodes=10**6, solved_reward=1e6), seed=0)
+"""
+    manager, client = start_new_kernel(kernel_name="python3")
+    try:
+
+        def interrupt_when_ready(message):
+            if message["msg_type"] == "stream" and "Episode 0" in message["content"]["text"]:
+                manager.interrupt_kernel()
+
+        reply = client.execute_interactive(cell, timeout=120, output_hook=interrupt_when_ready)
+        assert reply["content"]["status"] == "ok"
+        texts = []
+        client.execute_interactive(
+            "print(run.interrupted, len(run.episodes) < 10_000)",
+            timeout=60,
+            output_hook=lambda m: texts.append(m["content"].get("text", "")),
+        )
+        assert "True True" in "".join(texts)
+    finally:
+        client.stop_channels()
+        manager.shutdown_kernel(now=True)
+
+
+# The same bits in fresh processes
+
+
+BITS = """
+import sys
+from tests.faults import LOOPS, final_bits, play
+from tests.test_checkpoint import QUICK
+for loop in LOOPS:
+    play(loop, f"{sys.argv[1]}/{loop}", QUICK)
+    print(final_bits(f"{sys.argv[1]}/{loop}"))
+"""
+
+
+def test_fresh_processes_with_other_threads_and_hash_seeds_give_the_same_bits(tmp_path):
+    results = set()
+    for threads, hash_seed in [(1, 0), (2, 1), (2, 2)]:
+        numbers = {f"TF_NUM_{kind}OP_THREADS": str(threads) for kind in ("INTRA", "INTER")}
+        environment = {**os.environ, **numbers, "PYTHONHASHSEED": str(hash_seed)}
+        folder = tmp_path / f"{threads} {hash_seed}"
+        command = [sys.executable, "-c", BITS, folder]
+        results.add(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+    assert len(results) == 1
+    assert len(results.pop().split()) == 2
+
+
+# The network alone
+
+
+def test_a_saved_network_plays_the_same_and_is_only_a_network(tmp_path, cartpole):
+    run = train(cartpole, QUICK, SEED, verbose=0)
+    path = tmp_path / "new folder" / "agent.keras"
+    run.save(path)
+    run.save(path)
+    assert [p.name for p in path.parent.iterdir()] == ["agent.keras"]
+    for network in (load_agent(path), keras.saving.load_model(path)):
+        for ours, theirs in zip(network.get_weights(), run.q_network.get_weights(), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+        assert getattr(network, "optimizer", None) is None
+    returns = [evaluate(cartpole, n, num_episodes=3, seed=0) for n in (load_agent(path), run.q_network)]
+    np.testing.assert_array_equal(*returns)
+    with pytest.raises(ValueError, match=r"^path must end in \.keras, got 'agent\.h5'"):
+        run.save("agent.h5")
+
+
+def test_a_network_that_cannot_be_trusted_is_not_loaded(tmp_path):
+    path = tmp_path / "agent.keras"
+    with pytest.raises(FileNotFoundError, match=r"agent\.keras"):
+        load_agent(path)
+    network, _ = make_networks(4, 2, seed=0)
+    checkpoint.save_agent(path, network)
+    good, silent = path.read_bytes(), 0
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        spoilt = bytearray(good)
+        spoilt[rng.integers(len(good))] ^= 1 << rng.integers(8)
+        path.write_bytes(spoilt)
+        with contextlib.suppress(ValueError):  # a flip may also be in what is not the network, such as a date
+            loaded = load_agent(path).get_weights()
+            silent += any((a != b).any() for a, b in zip(loaded, network.get_weights(), strict=True))
+    assert silent == 0
+    network.set_weights([np.full_like(w, np.nan) for w in network.get_weights()])
+    checkpoint.save_agent(path, network)
+    with pytest.raises(ValueError, match=r"agent\.keras is not a network that can be loaded: .*not finite"):
+        load_agent(path)
+    unsafe = keras.Sequential([keras.Input((4,)), keras.layers.Lambda(lambda x: x)])
+    unsafe.save(path)
+    with pytest.raises(ValueError, match=r"agent\.keras is not a network that can be loaded"):
+        load_agent(path)
+
+
+def test_nothing_is_restored_from_a_checkpoint_that_is_not_there(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert Checkpoints(tmp_path / "none", CartPole(), CONFIG).restore(None, SEED) is None

@@ -1,0 +1,238 @@
+import dataclasses
+import hashlib
+import importlib
+import os
+import signal
+import threading
+import time
+
+import gymnasium as gym
+import numpy as np
+import psutil
+import pytest
+from scipy import stats
+
+from dqn_keras import Config, Study, compare, episode_seed, load_study, plot_study, study, summarize, train
+from dqn_keras.environments import CartPole
+from dqn_keras.study import Outcome
+from tests.environments import Corridor
+
+module = importlib.import_module("dqn_keras.study")  # `dqn_keras.study` is the function
+QUICK = Config(num_episodes=30, batch_size=16, solved_reward=1000)
+
+
+def digests(outcome):
+    return dict(zip(outcome.seeds.tolist(), (o.digest for o in outcome.outcomes), strict=True))
+
+
+def same(first, second):
+    assert first.seeds.tolist() == second.seeds.tolist()
+    assert digests(first) == digests(second)
+    np.testing.assert_array_equal(first.rewards, second.rewards)
+    np.testing.assert_array_equal(first.solved_at, second.solved_at)
+
+
+@pytest.mark.parametrize("env", [CartPole(), gym.make("CartPole-v1")], ids=["functional", "Gymnasium"])
+def test_a_seed_is_the_run_of_train_whichever_others_run_with_it_in_whatever_process(env):
+    outcomes = study(env, QUICK, [5, 3, 4, 0], num_workers=2, verbose=0)
+    assert outcomes.seeds.tolist() == [5, 3, 4, 0]
+    assert len(set(digests(outcomes).values())) == 4
+    alone = study(env, QUICK, [4], num_workers=1, verbose=0)
+    assert digests(alone)[4] == digests(outcomes)[4]
+    run = train(env, QUICK, 3, verbose=0)
+    weights = b"".join(w.tobytes() for w in [*run.q_network.get_weights(), *run.q_hat_network.get_weights()])
+    assert digests(outcomes)[3] == hashlib.sha256(weights).digest()
+    np.testing.assert_array_equal(outcomes.rewards[1], run.rewards)
+    assert outcomes.outcomes[1].steps.tolist() == [episode.steps for episode in run.episodes]
+    assert outcomes.num_env_steps == outcomes.rewards.sum()  # CartPole's reward is 1 a step
+
+
+def test_an_environment_that_is_not_registered_goes_to_the_workers_as_it_is():
+    config = Config(num_episodes=60, batch_size=8, solved_reward=3.5)
+    outcomes = study(Corridor(length=100, limit=4), config, range(3), num_workers=2, verbose=0)
+    assert outcomes.solved_at.tolist() == [49, 49, 49]
+    assert outcomes.rewards.shape == (3, 50)
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """The seeds that are trained, in this process."""
+    seeds, train_seed = [], module._train_seed
+
+    def note_and_train(recipe, config, seed):
+        seeds.append(seed)
+        return train_seed(recipe, config, seed)
+
+    monkeypatch.setattr(module, "_train_seed", note_and_train)
+    return seeds
+
+
+def test_the_same_study_again_does_only_what_is_missing(tmp_path, trained):
+    file = tmp_path / "studies" / "quick.npz"
+    first = study(CartPole(), QUICK, range(3), file=file, num_workers=1, verbose=0)
+    again = study(CartPole(), QUICK, range(3), file=file, num_workers=1, verbose=0)
+    assert trained == [0, 1, 2]
+    same(first, again)
+    more = study(CartPole(), QUICK, [4, 1], file=file, num_workers=1, verbose=0)
+    assert trained == [0, 1, 2, 4]
+    assert more.seeds.tolist() == [4, 1]
+    assert load_study(file).seeds.tolist() == [0, 1, 2, 4]
+    assert load_study(file).config == QUICK
+    assert digests(load_study(file)) == {**digests(first), **digests(more)}
+    for config, name in [(dataclasses.replace(QUICK, gamma=0.9), "gamma"), (Config(), "batch_size")]:
+        with pytest.raises(ValueError, match=rf"^{name} is .* in .*quick\.npz, got"):
+            study(CartPole(), config, range(3), file=file, verbose=0)
+    with pytest.raises(ValueError, match=r"^env is .*functional.*got .*CartPole-v1"):
+        study(gym.make("CartPole-v1"), QUICK, range(3), file=file, verbose=0)
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(ValueError, match=r"quick\.npz is not a study that can be loaded: its SHA-256"):
+        load_study(file)
+
+
+def test_ctrl_c_keeps_the_finished_seeds(tmp_path, monkeypatch, trained):
+    file, noted = tmp_path / "study.npz", module._train_seed
+
+    def interrupted_in_the_third(recipe, config, seed):
+        if seed == 2 and len(trained) == 2:
+            signal.raise_signal(signal.SIGINT)
+        return noted(recipe, config, seed)
+
+    monkeypatch.setattr(module, "_train_seed", interrupted_in_the_third)
+    with pytest.warns(UserWarning, match=r"^2 of 5 seeds are not in this study: the study was interrupted"):
+        kept = study(CartPole(), QUICK, range(5), file=file, num_workers=1, verbose=0)
+    assert kept.seeds.tolist() == load_study(file).seeds.tolist() == [0, 1, 2]
+    whole = study(CartPole(), QUICK, range(5), file=file, num_workers=1, verbose=0)
+    assert trained == [0, 1, 2, 3, 4]
+    same(whole, study(CartPole(), QUICK, range(5), num_workers=1, verbose=0))
+
+
+def test_an_error_in_a_worker_is_the_studys_and_the_finished_seeds_are_kept(tmp_path):
+    class Broken(Corridor):
+        def reset(self, *, seed=None, options=None):
+            if seed == episode_seed(2, 0):
+                raise RuntimeError("the simulator died")
+            return super().reset(seed=seed)
+
+    file, config = tmp_path / "study.npz", Config(num_episodes=9, batch_size=8)
+    with pytest.raises(RuntimeError, match="the simulator died"):
+        study(Broken(), config, range(4), file=file, num_workers=1, verbose=0)
+    assert load_study(file).seeds.tolist() == [0, 1]
+
+
+def test_the_bar_is_shown_unless_told_not_to(capfd):
+    study(CartPole(), QUICK, [0], num_workers=1)
+    assert "1/1" in capfd.readouterr().err
+    study(CartPole(), QUICK, [0], num_workers=1, verbose=0)
+    assert "1/1" not in capfd.readouterr().err
+
+
+def test_bad_arguments_are_named():
+    for bad, message in [
+        ({"seeds": [0, 0]}, r"^seeds must name each seed once"),
+        ({"seeds": [-1]}, r"^seeds must be a whole number"),
+        ({"engine": "dask"}, r"^engine must be one of joblib, ray, got 'dask'"),
+        ({"num_workers": 0}, r"^num_workers must be"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            study(CartPole(), QUICK, **bad)
+
+
+def test_without_ray_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setitem(importlib.sys.modules, "ray", None)
+    with pytest.raises(ImportError, match=r'pip install "dqn_keras\[ray\]"'):
+        study(CartPole(), QUICK, [0], engine="ray", verbose=0)
+
+
+# A cluster
+
+
+def kill_a_busy_worker(killed):
+    """Kill the first process that is at a seed."""
+    deadline = time.monotonic() + 120
+    while not killed and time.monotonic() < deadline:
+        for process in psutil.process_iter(["cmdline"]):
+            if "ray::_train_seed" in " ".join(process.info["cmdline"] or []):
+                os.kill(process.pid, signal.SIGKILL)
+                killed.append(process.pid)
+                return
+        time.sleep(0.05)
+
+
+def test_a_cluster_of_two_nodes_loses_a_worker_and_the_numbers_are_the_same(monkeypatch):
+    import ray
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("PYTHONPATH", os.getcwd(), prepend=os.pathsep)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        cluster.add_node(num_cpus=1)
+        ray.init(address=cluster.address, log_to_driver=False)
+        assert len(ray.nodes()) == 2
+        killed = []
+        killer = threading.Thread(target=kill_a_busy_worker, args=(killed,))
+        killer.start()
+        by_ray = study(CartPole(), QUICK, range(6), engine="ray", verbose=0)
+        killer.join()
+        assert len(killed) == 1
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    same(by_ray, study(CartPole(), QUICK, range(6), num_workers=2, verbose=0))
+
+
+# Statistics
+
+
+def made_up(*solved_at):
+    """A study of which only the episodes to solved matter."""
+    outcomes = [
+        Outcome(k, np.full(k + 60, 10.0 * k), np.full(k + 60, 10), at, bytes(32)) for k, at in enumerate(solved_at)
+    ]
+    return Study(Config(), outcomes)
+
+
+def test_a_summary_worked_out_by_hand():
+    outcomes = made_up(300, 280, None, 260, 320, 310, 290, 1000)
+    np.testing.assert_array_equal(outcomes.episodes_to_solved, [300, 280, 2000, 260, 320, 310, 290, 1000])
+    assert np.isnan(outcomes.solved_at[2])
+    summary = summarize(outcomes)
+    assert summary.share_solved.value == 7 / 8
+    assert 0.5 < summary.share_solved.low < 7 / 8 < summary.share_solved.high < 1
+    assert summary.median.value == 305
+    assert summary.interquartile_mean.value == (290 + 300 + 310 + 320) / 4
+    for estimate in summary[1:]:
+        assert estimate.low < estimate.value < estimate.high
+    assert str(summary.median).startswith("305.0 (")
+    assert repr(outcomes) == "<Study: 8 seeds, 7 solved>"
+    assert np.isnan(outcomes.rewards[0, 60:]).all()
+    assert outcomes.rewards.shape == (8, 67)
+
+
+def test_a_comparison_worked_out_by_hand():
+    first, second = made_up(300, 310, 320, 330), made_up(290, 300, 305, 315)
+    comparison = compare(first, second)
+    assert comparison.difference.value == 302.5 - 315
+    # of the 16 pairs the second is earlier in 4 + 3.5 + 3 + 2
+    assert comparison.probability_of_improvement.value == 12.5 / 16
+    assert compare(first, first).probability_of_improvement.value == 0.5
+    assert comparison.difference.low <= comparison.difference.value <= comparison.difference.high
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    rng = np.random.default_rng(0)
+    truth = stats.lognorm(0.5, scale=300)
+    held = 0
+    for _ in range(60):
+        low, high = summarize(made_up(*truth.rvs(40, random_state=rng).astype(int).tolist())).median[1:]
+        held += low <= truth.median() <= high
+    assert held >= 50  # of 60; a share of 0.95 gives fewer than once in a thousand
+
+
+def test_the_picture_of_a_study_says_what_it_shows():
+    axes = plot_study(made_up(300, 280, None, 260, 320, 310, 290, 1000))
+    assert [ax.get_xlabel() for ax in axes] == ["Episode", "Episodes to solved", "Episodes"]
+    assert axes[1].get_title() == "0 later (in the last bar), 1 not within 2,000"
+    assert axes[2].get_title() == "87.5% solved in the end"
+    legends = [text.get_text() for ax in axes[:2] for text in ax.get_legend().get_texts()]
+    assert {"each seed", "median", "middle half of the seeds", "the one published run (293)"} <= set(legends)
+    plot_study(made_up(None, None), published=None)  # also if nothing is solved
