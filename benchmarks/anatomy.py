@@ -87,19 +87,13 @@ def main() -> None:
     def forward(i: tf.Tensor) -> tf.Tensor:
         return loss_values(batch(i), CONFIG.gamma, learner.q_network, learner.q_hat_network)
 
-    def gradient(i: tf.Tensor) -> tf.Tensor:
-        with tf.GradientTape() as tape:
-            loss = forward(i)
-        return loss + 1e-9 * sum(tf.reduce_sum(g) for g in tape.gradient(loss, learner.q_network.trainable_variables))
-
     def sample(i: tf.Tensor) -> tf.Tensor:
         return tf.cast(tf.reduce_max(sample_indices(draw_bits(CONFIG.batch_size, key, i), key, i, 50_000)), tf.float32)
 
     parts = {
         "gather the batch": lambda i: tf.reduce_sum(batch(i).state),
         "the same, and the loss (one pass through each network)": forward,
-        "the same, and its gradient": gradient,
-        "the same, with Adam and the soft update: the whole update": lambda i: gradient_step(
+        "the same, with the gradient, Adam and the soft update: the whole update": lambda i: gradient_step(
             batch(i), CONFIG.gamma, *learner, CONFIG.tau
         ),
         "draw 64 different indices": sample,

@@ -7,6 +7,7 @@ written under another name, flushed to the disk, and only then given its own, so
 import contextlib
 import dataclasses
 import hashlib
+import inspect
 import io
 import json
 import os
@@ -38,6 +39,7 @@ class Checkpoints:
     def __init__(self, folder: str | os.PathLike, env: gym.Env | FuncEnv, config: Config) -> None:
         self.folder = Path(folder)
         self._identity = identity(env, config)
+        self._kept: list[Path] = []  # the newest first, all known to be whole
 
     def paths(self) -> list[Path]:
         """The files, the newest first."""
@@ -50,8 +52,8 @@ class Checkpoints:
         self.folder.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary:
             temporary.write_bytes(content)
-        older = [other for other in self.paths() if other.name < path.name]
-        for other in {*self.paths(), *self.folder.glob(".*.partial.npz")} - {path, *older[:1]}:
+        self._kept = [path, *(older for older in self._kept if older != path)][:2]
+        for other in {*self.paths(), *self.folder.glob(".*.partial.npz")} - set(self._kept):
             with contextlib.suppress(OSError):
                 other.unlink()
 
@@ -81,6 +83,7 @@ class Checkpoints:
             if damaged:
                 warnings.warn(f"{'; '.join(damaged)}. The run goes on from the older {path}", stacklevel=4)
             warn_of_other_versions(path, facts, self._identity, stacklevel=5)
+            self._kept = [path]
             return path
         if damaged:
             raise ValueError(f"checkpoint: {'; '.join(damaged)}")
@@ -182,6 +185,8 @@ def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any])
     expected = _arrays(agent)
     expected |= {f"episodes/{name}": np.zeros(max(0, num_episodes), dtype) for name, dtype in _COLUMNS.items()}
     expected["memory"] = agent.memory.rows[:num_appended]
+    # A run goes on while an average of Adam's overflows, as long as the weights are finite.
+    may_be_infinite = {"episodes/loss", *(v.path for v in agent.optimizer.variables)}
     if names := sorted(expected.keys() ^ arrays.keys()):
         raise DamagedError(f"its arrays are not an agent's: {', '.join(names)} missing or too many")
     for name, array in arrays.items():
@@ -190,7 +195,7 @@ def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any])
             raise DamagedError(
                 f"{name} has shape {array.shape} and dtype {array.dtype}, not {wanted.shape} and {wanted.dtype}"
             )
-        if name != "episodes/loss" and not np.isfinite(array).all():
+        if name not in may_be_infinite and not np.isfinite(array).all():
             raise DamagedError(f"{name} holds a number that is not finite")
     if arrays["episodes/steps"].sum() != num_appended or not 0 <= epsilon <= 1:
         raise DamagedError("its counts do not belong together")
@@ -205,24 +210,48 @@ def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any])
 
 
 def _describe(env: gym.Env | FuncEnv) -> dict[str, Any]:
-    """What makes it this environment; `render_mode` does not."""
+    """What makes it this environment, as far as can be seen; `render_mode` does not.
+
+    Of a registered one its id and arguments, of any other the constructor's arguments that it keeps under their names.
+    """
+    wrappers: list[Any] = []
     if isinstance(env, FuncEnv):
         name, arguments = f"{type(env).__name__} (functional)", vars(env)
-    elif env.spec:
-        name, arguments = env.spec.id, {**env.spec.kwargs, "max_episode_steps": env.spec.max_episode_steps}
     else:
-        name, arguments = type(env.unwrapped).__name__, {}
-    plain = (bool, int, float, str, type(None))
+        wrapper = env
+        while isinstance(wrapper, gym.Wrapper):
+            wrappers.append(type(wrapper).__name__)
+            wrapper = wrapper.env
+        if env.spec:
+            wrappers += [[w.name, _plain(w.kwargs)] for w in env.spec.additional_wrappers]
+            name, arguments = env.spec.id, {**env.spec.kwargs, "max_episode_steps": env.spec.max_episode_steps}
+        else:
+            parameters = inspect.signature(type(env.unwrapped).__init__).parameters
+            kept = vars(env.unwrapped)
+            name, arguments = type(env.unwrapped).__name__, {k: kept[k] for k in parameters if k in kept}
     return {
         "name": name,
-        "arguments": {
-            key: value if isinstance(value, plain) else type(value).__name__
-            for key, value in sorted(arguments.items())
-            if key != "render_mode"
-        },
+        "arguments": _plain({key: value for key, value in sorted(arguments.items()) if key != "render_mode"}),
+        "wrappers": wrappers,
         "observation_space": str(env.observation_space),
         "action_space": str(env.action_space),
     }
+
+
+def _plain(value: Any) -> Any:
+    """Something that JSON holds, equal for equal values; of what has no plain value, its type."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, dict):
+        return {str(key): _plain(x) for key, x in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(x) for x in value]
+    if tf.is_tensor(value) or isinstance(value, np.ndarray):
+        array = np.asarray(value)
+        return [str(array.dtype), list(array.shape), hashlib.sha256(array.tobytes()).hexdigest()]
+    return getattr(value, "__qualname__", type(value).__qualname__)
 
 
 def _versions() -> dict[str, str]:
@@ -248,23 +277,19 @@ def replacing(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         yield temporary
-        _flush(temporary)
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
-    if os.name == "posix":
-        _flush(path.parent)
-
-
-def _flush(path: Path) -> None:
-    """Wait until the file, or the folder's list of names, is on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    if os.name == "posix":  # the folder's list of names, too
+        descriptor = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def save_agent(path: str | os.PathLike, q_network: keras.Model) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import tensorflow as tf
 from gymnasium.experimental.functional import FuncEnv
 
+from dqn_keras._tensorflow import require_xla
 from dqn_keras.agent import Agent, Episode, draws_key
 from dqn_keras.config import Config
 from dqn_keras.environment import Spaces, check_spaces
@@ -79,8 +80,6 @@ def _bind_program(
     episodes_per_call: int,
     variables: tuple[tf.Variable, ...],
 ) -> Callable[..., list[tf.Tensor]]:
-    if not config.jit_compile:
-        raise ValueError("jit_compile must be True for a functional environment, got False: its loop needs XLA")
     constants = vars(env).items()
     is_like_its_class = all(x is None or isinstance(x, int | float | str) for _, x in constants)
     key = ("episodes", type(env), tuple(sorted(constants)) if is_like_its_class else env, config, episodes_per_call)
@@ -266,6 +265,7 @@ def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:
 
 def check_functional(env: FuncEnv) -> Spaces:
     """The sizes of its spaces; an error that names the environment if the loop cannot play it."""
+    require_xla()
     name = type(env).__name__
     spaces = check_spaces(name, env.observation_space, env.action_space)
     rng = tf.constant([0, 0], tf.int64)

@@ -42,10 +42,12 @@ def plot_study(
     """Three pictures of many seeds: how they learn, when they are solved, and how many are, by when.
 
     Args:
-        study: of at least two seeds.
+        study: of any number of seeds.
         axes: the three to draw in; by default a new figure of 15 by 4.5 inches.
         published: an episode to mark as what one run was reported to need, as the original's 293; None marks nothing.
     """
+    if not study.outcomes or study.config.num_episodes < study.config.solved_window:
+        raise ValueError(f"study must have seeds with at least solved_window episodes each, got {study}")
     if axes is None:
         _, axes = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained")
     curves, distribution, shares = axes
@@ -57,8 +59,8 @@ def plot_study(
     means = np.full((num_seeds, study.rewards.shape[1]), np.nan)  # of the last `window` episodes
     for row, outcome in zip(means, study.outcomes, strict=True):
         mean = np.convolve(outcome.rewards, np.full(window, 1 / window), mode="valid")
-        row[window - 1 : window - 1 + len(mean)] = mean
-        row[len(outcome.rewards) :] = mean[-1] if len(mean) else np.nan  # a run that has ended stays where it was
+        row[window - 1 : len(outcome.rewards)] = mean
+        row[len(outcome.rewards) :] = mean[-1]  # a run that has ended stays where it was
     means = means[:, :until]
     faint = curves.plot(means.T, color="0.5", alpha=max(0.02, min(1, 10 / num_seeds)), linewidth=0.7)
     faint[0].set_label("each seed")

@@ -74,7 +74,7 @@ class _NarrowDense(keras.layers.Dense):
     """
 
     def call(self, inputs: tf.Tensor, training: bool | None = None) -> tf.Tensor:
-        if len(inputs.shape) != 2:
+        if len(inputs.shape) != 2 or inputs.dtype != self.compute_dtype:
             return super().call(inputs, training)
         outputs = _narrow_product(tf.convert_to_tensor(inputs), tf.convert_to_tensor(self.kernel))
         if self.use_bias:

@@ -5,9 +5,12 @@ import dataclasses
 import functools
 import hashlib
 import os
+import pickle
+import signal
+import threading
 import time
 import warnings
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 import tensorflow as tf
 from gymnasium.experimental.functional import FuncEnv
-from joblib import Parallel, delayed, parallel_config
+from joblib import Parallel, cpu_count, delayed, parallel_config
 from scipy import stats
 from tqdm import TqdmWarning
 
@@ -31,8 +34,7 @@ from dqn_keras.checkpoint import (
     warn_of_other_versions,
 )
 from dqn_keras.config import Config, count
-from dqn_keras.interruption import stop_requests
-from dqn_keras.training import train
+from dqn_keras.training import check_arguments, train
 
 with warnings.catch_warnings(action="ignore", category=TqdmWarning):  # without ipywidgets a notebook's bar is text
     from tqdm.auto import tqdm
@@ -105,9 +107,10 @@ def study(
 ) -> Study:
     """Train one agent for each seed, several at once; each is the very run that `train(env, config, seed)` gives.
 
+    Ctrl-C ends it, and what is finished is returned; without `file` the rest of the seeds can only be done anew.
+
     Args:
-        env: as for `train`. Each worker process makes its own: a registered environment from its spec, any other
-            from a pickled copy.
+        env: as for `train`. Each worker process has a pickled copy of its own.
         config: the parameters of every run.
         seeds: whole numbers, each once.
         file: where to keep what is finished. The same study again does only what is missing; Ctrl-C, or a crash,
@@ -115,48 +118,66 @@ def study(
         engine: "joblib", processes on this machine; or "ray", tasks on the Ray cluster that this process is connected
             to, or else on this machine (needs the extra `ray`); a task whose worker dies is tried again.
         num_workers: processes of joblib; by default as many as there are cores. With 1 all is done in this process.
+            (Ray has as many as its cluster has cores.)
         verbose: 1 shows a progress bar, 0 nothing.
 
     Raises:
         TypeError, ValueError: as for `train`; or `file` is of another study (the message begins with what differs).
     """
+    check_arguments(env, config, verbose)
     seeds = [count("seeds", seed, at_least=0) for seed in seeds]
     if len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must name each seed once, got {seeds}")
     if engine not in _ENGINES:
         raise ValueError(f"engine must be one of {', '.join(_ENGINES)}, got {engine!r}")
-    num_workers = len(os.sched_getaffinity(0)) if num_workers is None else count("num_workers", num_workers)
+    num_workers = cpu_count() if num_workers is None else count("num_workers", num_workers)
     facts = {"format": FORMAT, **identity(env, config)}
     outcomes = {} if file is None else _load(Path(file), facts)
 
     missing = [seed for seed in seeds if seed not in outcomes]
     bar = tqdm(total=len(seeds), initial=len(seeds) - len(missing), unit="seed", disable=not verbose)
-    saved_at, was_asked = time.monotonic(), False
-    recipe = cloudpickle.dumps(env.spec if isinstance(env, gym.Env) and env.spec else env)
-    results = _ENGINES[engine](recipe, config, missing, num_workers)
-    with bar, contextlib.closing(results), stop_requests() as is_asked_to_stop:
+    saved_at, interrupted = time.monotonic(), False
+    with bar, contextlib.closing(_ENGINES[engine](_recipe(env), config, missing, num_workers)) as results:
         try:
-            for outcome in results if missing else ():
-                if outcome is not None:
-                    outcomes[outcome.seed] = outcome
-                    bar.update()
+            for outcome in results:
+                if outcome is None:  # a run in this process was asked to stop
+                    interrupted = True
+                    break
+                outcomes[outcome.seed] = outcome
+                bar.update()
                 if file is not None and time.monotonic() > saved_at + _SECONDS_BETWEEN_SAVES:
                     _save(Path(file), outcomes, facts)
                     saved_at = time.monotonic()
-                if was_asked := is_asked_to_stop():
-                    break
+        except KeyboardInterrupt:
+            interrupted = True
         finally:
             if file is not None and missing:
                 _save(Path(file), outcomes, facts)
-    unfinished = sum(seed not in outcomes for seed in seeds)
-    if unfinished:
-        how = "the study was interrupted" if was_asked else "their runs were interrupted"
-        warnings.warn(f"{unfinished} of {len(seeds)} seeds are not in this study: {how}", stacklevel=2)
+    if interrupted:
+        unfinished = sum(seed not in outcomes for seed in seeds)
+        warnings.warn(f"{unfinished} of {len(seeds)} seeds are not in this study: it was interrupted", stacklevel=2)
     return Study(config, [outcomes[seed] for seed in seeds if seed in outcomes])
 
 
 _SECONDS_BETWEEN_SAVES = 10
 _Results = Generator[Outcome | None, None, None]
+
+
+def _recipe(env: gym.Env | FuncEnv) -> bytes:
+    """What a worker makes its environment from: a copy, or, if it cannot be copied, as after rendering, its spec."""
+    try:
+        return cloudpickle.dumps(env)
+    except (TypeError, AttributeError, pickle.PicklingError):
+        if not (isinstance(env, gym.Env) and env.spec):
+            raise
+        return cloudpickle.dumps(env.spec)
+
+
+@functools.lru_cache(maxsize=1)
+def _env(recipe: bytes) -> gym.Env | FuncEnv:
+    """The process's own environment, made once, so that its program is compiled once."""
+    env = cloudpickle.loads(recipe)
+    return gym.make(env) if isinstance(env, gym.envs.registration.EnvSpec) else env
 
 
 def _train_seed(recipe: bytes, config: Config, seed: int) -> Outcome | None:
@@ -172,26 +193,33 @@ def _train_seed(recipe: bytes, config: Config, seed: int) -> Outcome | None:
 
 
 def _train_seed_in_worker(recipe: bytes, config: Config, seed: int) -> Outcome | None:
-    """The same in a process of its own, where TensorFlow gets one thread: there is a process for each core."""
+    """The same in a process of its own. TensorFlow gets one thread there: there is a process for each core."""
     with contextlib.suppress(RuntimeError):  # it has started already, in a worker that someone else has used
         tf.config.threading.set_intra_op_parallelism_threads(1)
     return _train_seed(recipe, config, seed)
 
 
-@functools.lru_cache(maxsize=1)
-def _env(recipe: bytes) -> gym.Env | FuncEnv:
-    """The process's own environment, made once, so that its program is compiled once."""
-    env = cloudpickle.loads(recipe)
-    return gym.make(env) if isinstance(env, gym.envs.registration.EnvSpec) else env
-
-
 def _by_joblib(recipe: bytes, config: Config, seeds: list[int], num_workers: int) -> _Results:
-    if num_workers == 1 or len(seeds) == 1:
+    if num_workers == 1 or len(seeds) <= 1:
         yield from (_train_seed(recipe, config, seed) for seed in seeds)
         return
-    with parallel_config(backend="loky", inner_max_num_threads=1):
+    with parallel_config(backend="loky", inner_max_num_threads=1), _interrupts_ignored_by_children():
         parallel = Parallel(n_jobs=min(num_workers, len(seeds)), batch_size=1, return_as="generator_unordered")
-        yield from parallel(delayed(_train_seed_in_worker)(recipe, config, seed) for seed in seeds)
+        results = parallel(delayed(_train_seed_in_worker)(recipe, config, seed) for seed in seeds)
+    yield from results
+
+
+@contextlib.contextmanager
+def _interrupts_ignored_by_children() -> Iterator[None]:
+    """A terminal sends Ctrl-C to all its processes; those that start in here leave it to this one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 def _by_ray(recipe: bytes, config: Config, seeds: list[int], _: int) -> _Results:
@@ -199,17 +227,20 @@ def _by_ray(recipe: bytes, config: Config, seeds: list[int], _: int) -> _Results
         import ray
     except ImportError:
         raise ImportError('engine="ray" needs the extra `ray`: pip install "dqn_keras[ray]"') from None
-    if not ray.is_initialized():
+    is_ours = not ray.is_initialized()
+    if is_ours:
         ray.init(include_dashboard=False, log_to_driver=False)
     task = ray.remote(max_retries=3)(_train_seed_in_worker)
     waiting = [task.remote(recipe, config, seed) for seed in seeds]
     try:
         while waiting:
-            done, waiting = ray.wait(waiting, timeout=1.0)
-            yield from ray.get(done) or [None]  # so that the caller can stop
+            done, waiting = ray.wait(waiting)
+            yield from ray.get(done)
     finally:
         for unfinished in waiting:
             ray.cancel(unfinished, force=True)
+        if is_ours:
+            ray.shutdown()
 
 
 _ENGINES = {"joblib": _by_joblib, "ray": _by_ray}
@@ -243,11 +274,11 @@ def _load(path: Path, facts: dict[str, Any]) -> dict[int, Outcome]:
 def _read(path: Path) -> tuple[dict[int, Outcome], dict[str, Any]]:
     try:
         arrays, facts = from_bytes(path.read_bytes())
-        ends = np.cumsum(arrays["num_episodes"])[:-1]
+        seeds, ends = arrays["seeds"].tolist(), np.cumsum(arrays["num_episodes"])
         columns = zip(
-            arrays["seeds"].tolist(),
-            np.split(arrays["rewards"], ends),
-            np.split(arrays["steps"], ends),
+            seeds,
+            np.split(arrays["rewards"], ends)[: len(seeds)],
+            np.split(arrays["steps"], ends)[: len(seeds)],
             [None if k < 0 else k for k in arrays["solved_at"].tolist()],
             [digest.tobytes() for digest in arrays["digests"]],
             strict=True,
@@ -289,6 +320,8 @@ class Summary(NamedTuple):
 
 def summarize(study: Study) -> Summary:
     """Share of seeds solved, median and interquartile mean of the episodes to solved."""
+    if not study.outcomes:
+        raise ValueError("study must have at least one seed, got none")
     episodes, num_solved = study.episodes_to_solved, int(np.isfinite(study.solved_at).sum())
     share = stats.binomtest(num_solved, len(episodes)).proportion_ci(method="wilson")
     return Summary(

@@ -27,7 +27,7 @@ class Run:
     agent: Agent
     """Networks, optimizer, memory and random state, as the last episode left them."""
     interrupted: bool = False
-    """Whether Ctrl-C or SIGTERM ended it, at the end of an episode."""
+    """Whether Ctrl-C or SIGTERM came: it has then ended at the end of that episode."""
 
     @property
     def solved_at(self) -> int | None:
@@ -90,7 +90,8 @@ def train(
         verbose: 1 prints a line every 100 episodes and one when solved, 0 nothing.
         callbacks: Keras callbacks; an episode is an epoch, and its logs are number, reward, steps, epsilon, loss.
         checkpoint: a folder for this run's checkpoints, each its whole state; None saves none. If the disk refuses
-            one on the way, that is a warning, and the run goes on.
+            one on the way, that is a warning, and the run goes on. What is put into the environment after it was made,
+            or kept under other names than the constructor's, is not noticed to differ.
         checkpoint_every: episodes between two of them, or a few more where episodes are compiled; the start and the
             end of the run are saved too.
         resume: go on from the newest checkpoint in the folder that is whole, or start if there is none yet. The
@@ -104,10 +105,7 @@ def train(
         TypeError, ValueError: an argument or a space is not supported; the environment returned a NaN,
             an infinity or another shape than promised (the message names episode and step); learning diverged.
     """
-    if not isinstance(config, Config):
-        raise TypeError(f"config must be a Config, got {config!r}")
-    if verbose not in (0, 1):
-        raise ValueError(f"verbose must be 0 or 1, got {verbose!r}")
+    check_arguments(env, config, verbose)
     if resume and checkpoint is None:
         raise ValueError("resume needs a folder to resume from: checkpoint, got None")
     checkpoint_every = count("checkpoint_every", checkpoint_every)
@@ -128,32 +126,32 @@ def train(
         _start_or_resume(checkpoints, agent, seed, resume, verbose)
 
     saved_at = len(agent.episodes)
-    is_over, interrupted = _is_solved(agent.episodes, config), False  # a resumed run may be solved already
+    is_over = _is_solved(agent.episodes, config)  # a resumed run may be
     if callbacks:
         episodes = _with_callbacks(episodes, agent, config, callbacks)
-    with contextlib.closing(episodes) as played, stop_requests() as is_asked_to_stop:
-        while not is_over and (episode := next(played, None)):
-            if verbose and episode.number % 100 == 0:
-                last = [e.reward for e in agent.episodes[max(0, episode.number - 99) : episode.number + 1]]
-                average = round(float(np.mean(last)), 2)
-                print(f"Episode {episode.number}, Reward: {episode.reward}, Last 100 Average: {average}")
-            if len(agent.episodes) > episode.number + 1:
-                continue  # compiled episodes: the agent is already further
-            is_over = _is_solved(agent.episodes, config) or len(agent.episodes) == config.num_episodes
-            if not is_over and is_asked_to_stop():
-                is_over = interrupted = True
-            if checkpoints and (is_over or len(agent.episodes) >= saved_at + checkpoint_every):
-                _save_or_warn(checkpoints, agent)
-                saved_at = len(agent.episodes)
+    with stop_requests() as is_asked_to_stop:
+        with contextlib.closing(episodes) as played:
+            while not is_over and (episode := next(played, None)):
+                if verbose and episode.number % 100 == 0:
+                    last = [e.reward for e in agent.episodes[max(0, episode.number - 99) : episode.number + 1]]
+                    average = round(float(np.mean(last)), 2)
+                    print(f"Episode {episode.number}, Reward: {episode.reward}, Last 100 Average: {average}")
+                if len(agent.episodes) > episode.number + 1:
+                    continue  # compiled episodes: the agent is already further
+                if checkpoints and len(agent.episodes) >= saved_at + checkpoint_every:
+                    _save_or_warn(checkpoints, agent)
+                    saved_at = len(agent.episodes)
+                is_over = _is_solved(agent.episodes, config) or is_asked_to_stop()
+        if checkpoints and (callbacks or len(agent.episodes) > saved_at):
+            _save_or_warn(checkpoints, agent)  # after on_train_end, in which a callback may change the agent
+        interrupted = is_asked_to_stop()
 
     run = Run(config, agent, interrupted)
-    if checkpoints and len(agent.episodes) > saved_at:
-        _save_or_warn(checkpoints, agent)
     if verbose and run.solved_at is not None:
         average = round(float(np.mean(run.rewards[-config.solved_window :])), 2)
         print(f"Solved with {average} reward in {run.solved_at} episodes!")
-    if verbose and interrupted:
-        how = ", and goes on with resume=True" if checkpoints else ""
+    elif verbose and interrupted:
+        how = "; resume=True goes on from the last checkpoint" if checkpoints else ""
         print(f"Interrupted: the run has {len(agent.episodes)} episodes{how}")
     if not agent.num_updates and not interrupted:
         warnings.warn(
@@ -162,6 +160,18 @@ def train(
             stacklevel=2,
         )
     return run
+
+
+def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> None:
+    """TypeError or ValueError that names the one which cannot be used."""
+    if not isinstance(env, gym.Env | FuncEnv):
+        raise TypeError(f"env must be a gymnasium.Env or a FuncEnv, got {env!r}")
+    if not isinstance(config, Config):
+        raise TypeError(f"config must be a Config, got {config!r}")
+    if verbose not in (0, 1):
+        raise ValueError(f"verbose must be 0 or 1, got {verbose!r}")
+    if isinstance(env, FuncEnv) and not config.jit_compile:
+        raise ValueError("jit_compile must be True for a functional environment, got False: its loop needs XLA")
 
 
 def _is_solved(episodes: Sequence[Episode], config: Config) -> bool:
@@ -191,8 +201,7 @@ def _save_or_warn(checkpoints: Checkpoints, agent: Agent) -> None:
         checkpoints.save(agent)
     except OSError as error:
         warnings.warn(
-            f"checkpoint after episode {len(agent.episodes) - 1} could not be saved ({error}); "
-            "the last one stays, and the run goes on",
+            f"checkpoint after episode {len(agent.episodes) - 1} could not be saved ({error}); the last one stays",
             stacklevel=3,
         )
 

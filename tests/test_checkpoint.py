@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import warnings
+from pathlib import Path
 
 import gymnasium as gym
 import keras
@@ -127,6 +128,45 @@ def test_the_folder_keeps_the_last_two_and_nothing_else(tmp_path):
     assert sorted(path.name for path in folder.iterdir()) == ["checkpoint-0000000035.npz", "checkpoint-0000000040.npz"]
 
 
+def test_a_damaged_checkpoint_is_not_one_of_the_two_that_are_kept(tmp_path):
+    play("Gymnasium loop", tmp_path, QUICK)
+    newest(tmp_path).write_bytes(b"")
+    with pytest.warns(UserWarning, match="0040"):
+        play("Gymnasium loop", tmp_path, dataclasses.replace(QUICK, num_episodes=42))
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["checkpoint-0000000040.npz", "checkpoint-0000000042.npz"]
+    for path in tmp_path.iterdir():
+        from_bytes(path.read_bytes())
+
+
+def test_a_run_that_cannot_start_leaves_no_checkpoint(tmp_path):
+    with pytest.raises(ValueError, match=r"^jit_compile must be True for a functional environment"):
+        train(CartPole(), dataclasses.replace(QUICK, jit_compile=False), checkpoint=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+class Paying(Corridor):
+    """A Corridor whose reward is an argument."""
+
+    def __init__(self, amount):
+        super().__init__(length=100, limit=4, reward=lambda t: float(amount))
+        self.amount = amount
+
+
+class Doubled(gym.RewardWrapper):
+    def reward(self, reward):
+        return 2 * reward
+
+
+@pytest.mark.parametrize("other", [Paying(2), Paying(np.float32(2)), Paying([1]), Doubled(Paying(1))])
+def test_an_environment_made_otherwise_is_another(other, tmp_path):
+    config = dataclasses.replace(QUICK, batch_size=4)
+    play(None, tmp_path, config, env=Paying(1))
+    play(None, tmp_path, config, env=Paying(np.int64(1)))  # is the same
+    with pytest.raises(ValueError, match=r"^env is "):
+        play(None, tmp_path, config, env=other)
+
+
 def test_other_versions_are_one_warning(tmp_path):
     play("Gymnasium loop", tmp_path, QUICK)
     arrays, facts = from_bytes(newest(tmp_path).read_bytes())
@@ -158,22 +198,34 @@ def test_what_callbacks_change_is_kept(tmp_path):
     assert fingerprint(resumed) == fingerprint(whole)
 
 
+class LastWord(keras.callbacks.Callback):
+    """Changes the agent at the very end, as EarlyStopping may."""
+
+    def on_train_end(self, logs=None):
+        self.model.set_weights([w + 1 for w in self.model.get_weights()])
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_what_a_callback_does_at_the_end_is_saved_too(loop, tmp_path):
+    run = play(loop, tmp_path, QUICK, callbacks=[LastWord()])
+    assert fingerprint(play(loop, tmp_path, QUICK)) == fingerprint(run)
+
+
 # Saves that fail
 
 
 NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
-FAILURES = {
-    "no space": (os, "fsync", NO_SPACE),
-    "an input/output error": (os, "open", OSError(errno.EIO, "Input/output error")),
-    "no permission": (os, "replace", PermissionError(errno.EACCES, "Permission denied")),
+FAILURES = {  # what fails, and how often it goes well before: a save flushes a file and a folder
+    "no space": (os, "fsync", NO_SPACE, 4),
+    "an input/output error": (Path, "write_bytes", OSError(errno.EIO, "Input/output error"), 2),
+    "no permission": (os, "replace", PermissionError(errno.EACCES, "Permission denied"), 2),
 }
 
 
-@pytest.mark.parametrize(("module", "name", "error"), FAILURES.values(), ids=FAILURES.keys())
-def test_a_save_that_fails_leaves_the_last_checkpoint_and_no_litter(module, name, error, tmp_path):
-    calls = 4 if name == "fsync" else 2  # the first two saves go well
+@pytest.mark.parametrize(("owner", "name", "error", "after"), FAILURES.values(), ids=FAILURES.keys())
+def test_a_save_that_fails_leaves_the_last_checkpoint_and_no_litter(owner, name, error, after, tmp_path):
     with (
-        faults.failing(checkpoint.os, name, error, after=calls if name == "replace" else 4),
+        faults.failing(owner, name, error, after),
         pytest.warns(
             UserWarning, match=rf"^checkpoint after episode \d+ could not be saved \(.*{error.strerror}"
         ) as caught,
@@ -256,6 +308,14 @@ def test_a_request_stops_the_run_at_the_end_of_that_episode(loop, number, capsys
     assert len(run.episodes) == 8
     assert capsys.readouterr().out.splitlines()[-1] == "Interrupted: the run has 8 episodes"
     assert [signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
+def test_a_request_in_the_last_episode_is_not_lost(cartpole):
+    run = train(
+        cartpole, dataclasses.replace(QUICK, num_episodes=8), SEED, verbose=0, callbacks=[Asking(signal.SIGINT)]
+    )
+    assert run.interrupted
+    assert len(run.episodes) == 8
 
 
 def test_a_second_ctrl_c_stops_at_once(cartpole):

@@ -107,6 +107,13 @@ def test_narrow_layers_learn_the_same_whether_compiled_or_not(num_actions):
         np.testing.assert_allclose(compiled, eager, rtol=1e-5, atol=1e-6)
 
 
+def test_a_narrow_layer_on_whole_numbers_learns(random_batch):
+    networks = [keras.Sequential([keras.Input((4,), dtype="int32"), keras.layers.Dense(2)]) for _ in range(2)]
+    before = networks[0].get_weights()[0]
+    learn(random_batch(), 0.95, *networks, keras.optimizers.SGD(0.1))
+    assert (networks[0].get_weights()[0] != before).any()
+
+
 def test_the_gradient_agrees_with_the_oracle_and_is_qs_alone(random_batch):
     q_network, q_hat_network, _ = agent()
     q_hat_network.set_weights([w + 0.1 for w in q_hat_network.get_weights()])

@@ -3,6 +3,8 @@ import hashlib
 import importlib
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -89,21 +91,63 @@ def test_the_same_study_again_does_only_what_is_missing(tmp_path, trained):
         load_study(file)
 
 
-def test_ctrl_c_keeps_the_finished_seeds(tmp_path, monkeypatch, trained):
-    file, noted = tmp_path / "study.npz", module._train_seed
+def test_an_interrupted_run_in_this_process_ends_the_study_with_what_is_finished(tmp_path, monkeypatch, trained):
+    file, train_seed = tmp_path / "study.npz", module._train_seed
 
     def interrupted_in_the_third(recipe, config, seed):
         if seed == 2 and len(trained) == 2:
-            signal.raise_signal(signal.SIGINT)
-        return noted(recipe, config, seed)
+            threading.Timer(0.05, signal.raise_signal, [signal.SIGINT]).start()
+            config = dataclasses.replace(config, num_episodes=10**6)
+        return train_seed(recipe, config, seed)
 
     monkeypatch.setattr(module, "_train_seed", interrupted_in_the_third)
-    with pytest.warns(UserWarning, match=r"^2 of 5 seeds are not in this study: the study was interrupted"):
+    with pytest.warns(UserWarning, match=r"^3 of 5 seeds are not in this study: it was interrupted"):
         kept = study(CartPole(), QUICK, range(5), file=file, num_workers=1, verbose=0)
-    assert kept.seeds.tolist() == load_study(file).seeds.tolist() == [0, 1, 2]
+    assert kept.seeds.tolist() == load_study(file).seeds.tolist() == [0, 1]
     whole = study(CartPole(), QUICK, range(5), file=file, num_workers=1, verbose=0)
-    assert trained == [0, 1, 2, 3, 4]
     same(whole, study(CartPole(), QUICK, range(5), num_workers=1, verbose=0))
+
+
+STUDY = """
+import sys
+import gymnasium as gym
+from dqn_keras import Config, study
+print("ready", flush=True)
+config = Config(num_episodes=100, solved_reward=1000)
+outcome = study(gym.make("CartPole-v1"), config, range(10_000), file=sys.argv[1], num_workers=2, verbose=0)
+print("kept", len(outcome.seeds), flush=True)
+"""
+
+
+@pytest.mark.parametrize("seconds", [1, 14])  # while the workers start; when seeds are finished
+def test_ctrl_c_in_a_terminal_keeps_the_finished_seeds(seconds, tmp_path):
+    file = tmp_path / "study.npz"
+    command = [sys.executable, "-W", "ignore", "-c", STUDY, file]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    assert child.stdout.readline() == "ready\n"
+    time.sleep(seconds)
+    os.killpg(child.pid, signal.SIGINT)  # as a terminal does: to all of its processes
+    out, err = child.communicate(timeout=60)
+    assert child.returncode == 0, err
+    assert "Traceback" not in err
+    word, number = out.split()
+    assert word == "kept"
+    assert int(number) == len(load_study(file).seeds)
+
+
+def test_an_environment_is_copied_as_it_is():
+    env = gym.make("CartPole-v1")
+    env.unwrapped.gravity = 500.0
+    outcomes = study(env, QUICK, [0, 1], num_workers=2, verbose=0)
+    np.testing.assert_array_equal(outcomes.rewards[0], train(env, QUICK, 0, verbose=0).rewards)
+
+
+def test_an_environment_that_has_rendered_is_made_anew_from_its_spec():
+    env = gym.make("CartPole-v1", render_mode="rgb_array")
+    env.reset(seed=0)
+    env.render()
+    outcomes = study(env, QUICK, [0, 1], num_workers=2, verbose=0)
+    np.testing.assert_array_equal(outcomes.rewards[1], train(gym.make("CartPole-v1"), QUICK, 1, verbose=0).rewards)
 
 
 def test_an_error_in_a_worker_is_the_studys_and_the_finished_seeds_are_kept(tmp_path):
@@ -135,6 +179,14 @@ def test_bad_arguments_are_named():
     ]:
         with pytest.raises(ValueError, match=message):
             study(CartPole(), QUICK, **bad)
+    with pytest.raises(TypeError, match=r"^env must be a gymnasium\.Env or a FuncEnv, got 'CartPole-v1'"):
+        study("CartPole-v1")
+    with pytest.raises(TypeError, match=r"^config must be a Config"):
+        study(CartPole(), {})
+    with pytest.raises(ValueError, match=r"^study must have at least one seed"):
+        summarize(Study(QUICK, []))
+    with pytest.raises(ValueError, match=r"^study must have seeds with at least solved_window episodes"):
+        plot_study(Study(QUICK, []))
 
 
 def test_without_ray_the_error_names_the_extra(monkeypatch):
