@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 import cloudpickle
 import gymnasium as gym
 import numpy as np
+import scipy  # whose parts are imported when they are used
 import tensorflow as tf
 from gymnasium.experimental.functional import FuncEnv
 from joblib import Parallel, cpu_count, delayed, parallel_config
-from scipy import stats
 from tqdm import TqdmWarning
 
 from dqn_keras.agent import recycle
@@ -323,11 +323,11 @@ def summarize(study: Study) -> Summary:
     if not study.outcomes:
         raise ValueError("study must have at least one seed, got none")
     episodes, num_solved = study.episodes_to_solved, int(np.isfinite(study.solved_at).sum())
-    share = stats.binomtest(num_solved, len(episodes)).proportion_ci(method="wilson")
+    share = scipy.stats.binomtest(num_solved, len(episodes)).proportion_ci(method="wilson")
     return Summary(
         Estimate(num_solved / len(episodes), float(share.low), float(share.high)),
         _bootstrap(np.median, episodes),
-        _bootstrap(functools.partial(stats.trim_mean, proportiontocut=0.25), episodes),
+        _bootstrap(functools.partial(scipy.stats.trim_mean, proportiontocut=0.25), episodes),
     )
 
 
@@ -351,7 +351,7 @@ def _difference(first: np.ndarray, second: np.ndarray, axis: int = -1) -> np.nda
 
 
 def _probability_of_improvement(first: np.ndarray, second: np.ndarray, axis: int = -1) -> np.ndarray:
-    u = stats.mannwhitneyu(first, second, axis=axis, method="asymptotic").statistic
+    u = scipy.stats.mannwhitneyu(first, second, axis=axis, method="asymptotic").statistic
     return u / (first.shape[axis] * second.shape[axis])
 
 
@@ -359,7 +359,7 @@ def _bootstrap(statistic: Any, *samples: np.ndarray) -> Estimate:
     value = float(statistic(*samples))
     if all(len(np.unique(sample)) == 1 for sample in samples):  # as in a study of one seed: nothing to resample
         return Estimate(value, np.nan, np.nan)
-    interval = stats.bootstrap(
+    interval = scipy.stats.bootstrap(
         samples, statistic, n_resamples=2_000, method="percentile", rng=np.random.default_rng(0), batch=200
     ).confidence_interval
     return Estimate(value, float(interval.low), float(interval.high))

@@ -1,5 +1,6 @@
 import gymnasium as gym
 import numpy as np
+import psutil
 import pytest
 
 from dqn_keras import Config
@@ -168,3 +169,17 @@ def test_weights_that_become_nan_stop_the_run_in_the_same_update(cartpole):
     agent.q_hat_network.weights[0].assign(np.full((4, 64), np.nan))
     with pytest.raises(ValueError, match=r"not finite in episode 10, step 0: learning has diverged"):
         next(loop)
+
+
+def test_resident_memory_stays_flat_over_150_000_steps(cartpole):
+    config = Config(num_episodes=100_000, epsilon=0.1)
+    agent = make_agent(4, 2, config, 0)
+    loop = episodes(CheckedEnv(cartpole), agent, config)
+
+    def after(num_steps):
+        while agent.memory.num_appended < num_steps:
+            next(loop)
+        return psutil.Process().memory_info().rss / 1e6
+
+    before = after(50_000)  # the replay memory is full
+    assert after(150_000) - before < 5  # MB
