@@ -296,6 +296,16 @@ def _train_and_report(loop, folder, started, report):
     Path(report).write_text("interrupted" if run.interrupted else "ended")
 
 
+def _after_first_checkpoint(folder):
+    """Wait for it, with which a run begins: -> the time."""
+    start = time.perf_counter()
+    while not list(folder.glob("checkpoint-*.npz")):
+        if time.perf_counter() > start + 120:
+            raise TimeoutError(f"no checkpoint in {folder}")
+        time.sleep(0.01)
+    return time.perf_counter()
+
+
 def signal_campaign(folder, number, seed=0):
     """Ask runs to stop by SIGINT and SIGTERM at random times: -> requests, how many stopped a run, differing runs.
 
@@ -309,13 +319,12 @@ def signal_campaign(folder, number, seed=0):
         reference, run_folder, report = folder / f"reference {loop}", folder / f"run {k}", folder / f"report {k}"
         if not reference.exists():
             process = child_process(_train_in_child, loop, reference, None)
-            start = time.perf_counter()
+            start = _after_first_checkpoint(reference)
             process.join()
             seconds[loop] = time.perf_counter() - start
         process = child_process(_train_and_report, loop, run_folder, report)
-        while not list(run_folder.glob("checkpoint-*.npz")):
-            time.sleep(0.01)
-        process.join(rng.uniform(0.2, 0.9 * seconds[loop]))  # compilation and training follow the first checkpoint
+        _after_first_checkpoint(run_folder)
+        process.join(rng.uniform(0.2, 0.8 * seconds[loop]))  # compilation and training
         if process.is_alive():
             os.kill(process.pid, kind)
             figures["signals"] += 1
