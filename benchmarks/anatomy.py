@@ -56,7 +56,7 @@ def matmul_gigaflops(size: int = 768) -> float:
 
 def whole_turn() -> tuple[float, float]:
     """Microseconds of a turn, and env steps per second, of long episodes."""
-    agent, env = make_agent(4, 2, CONFIG, 0), CartPole()
+    agent, env = make_agent((4,), 2, CONFIG, 0), CartPole()
     loop = episodes(env, check_functional(env), agent, CONFIG)
     while agent.memory.num_appended < 60_000:  # learn to balance first
         next(loop)
@@ -73,7 +73,7 @@ def whole_turn() -> tuple[float, float]:
 
 def main() -> None:
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # Linux
-    agent, rng = make_agent(4, 2, CONFIG, 0), np.random.default_rng(0)
+    agent, rng = make_agent((4,), 2, CONFIG, 0), np.random.default_rng(0)
     learner = agent.learner.template(jit_compile=True)  # whose layers are those that a program compiles
     data = rng.normal(size=agent.memory.rows.shape).astype(np.float32)
     data[:, 8:] = np.stack([rng.integers(2, size=len(data)), np.ones(len(data)), np.zeros(len(data))], axis=1)
@@ -82,7 +82,7 @@ def main() -> None:
     key = tf.constant(1, tf.int64)
 
     def batch(i: tf.Tensor):
-        return unpack(tf.gather(rows, (indices + i) % CONFIG.memory_size), 4)
+        return unpack(tf.gather(rows, (indices + i) % CONFIG.memory_size), (4,))
 
     def forward(i: tf.Tensor) -> tf.Tensor:
         return loss_values(batch(i), CONFIG.gamma, learner.q_network, learner.q_hat_network)

@@ -101,7 +101,7 @@ def cost_of_compiled_checks(rounds: int = 30) -> dict[str, str]:
     for is_all_finite in (checks, lambda *_: tf.constant(True)):
         compiled_loop.is_all_finite = is_all_finite
         _programs.clear()
-        agent = make_agent(4, 2, config, 0)
+        agent = make_agent((4,), 2, config, 0)
         loop = compiled_loop.episodes(CartPole(), compiled_loop.check_functional(CartPole()), agent, config)
         while agent.memory.num_appended < 60_000:
             next(loop)

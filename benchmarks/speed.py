@@ -38,7 +38,7 @@ SEED = 0
 def gymnasium_loop() -> Callable[[int], int]:
     """Return a function: play at least so many steps -> steps played. The other programs alike."""
     env = CheckedEnv(gym.make("CartPole-v1"))
-    loop = episodes(env, make_agent(4, 2, CONFIG, SEED), CONFIG)
+    loop = episodes(env, make_agent((4,), 2, CONFIG, SEED), CONFIG)
 
     def play(num_steps: int) -> int:
         played = 0
@@ -50,7 +50,7 @@ def gymnasium_loop() -> Callable[[int], int]:
 
 
 def compiled_loop() -> Callable[[int], int]:
-    agent = make_agent(4, 2, CONFIG, SEED)
+    agent = make_agent((4,), 2, CONFIG, SEED)
     env = CartPole()
     loop = compiled_loop_episodes(env, check_functional(env), agent, CONFIG)
 
@@ -101,7 +101,7 @@ def rejax() -> Callable[[int], int]:
 
 
 def eager_original() -> Callable[[int], int]:
-    agent = make_agent(4, 2, CONFIG, SEED)
+    agent = make_agent((4,), 2, CONFIG, SEED)
     env = gym.make("CartPole-v1")
     steps = original_algorithm.run(
         env, agent.q_network, agent.q_hat_network, agent.rng, lambda k: episode_seed(SEED, k), epsilon=0.1

@@ -1,4 +1,7 @@
-"""TensorFlow, imported without a word, and checked to be the backend that Keras runs on."""
+"""TensorFlow and Keras, imported without a word, and Keras checked to run on TensorFlow.
+
+The other modules take `keras` and `tf` from here, so that it does not matter which of them is imported first.
+"""
 
 import contextlib
 import functools
@@ -24,24 +27,28 @@ def _native_stderr_silenced() -> Iterator[None]:
         os.close(nowhere)
 
 
-def require_tensorflow_backend() -> None:
-    """Import TensorFlow and Keras quietly; ImportError if Keras was told to run on something else."""
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # errors still show
-    advice = "unset KERAS_BACKEND, or set it to 'tensorflow' before Keras is imported"
-    if os.environ.get("KERAS_BACKEND", "tensorflow") != "tensorflow":
-        raise ImportError(f"dqn_keras needs Keras on TensorFlow, not on {os.environ['KERAS_BACKEND']!r}: {advice}")
-    with _native_stderr_silenced():
-        import keras
-        import tensorflow  # noqa: F401
-    if keras.backend.backend() != "tensorflow":
-        raise ImportError(f"dqn_keras needs Keras on TensorFlow, not on {keras.backend.backend()!r}: {advice}")
+def require_tensorflow_backend(name: str) -> None:
+    """ImportError, with what to do, if `name` is not the backend that the package needs."""
+    if name != "tensorflow":
+        raise ImportError(
+            f"dqn_keras needs Keras on TensorFlow, not on {name!r}: "
+            "unset KERAS_BACKEND, or set it to 'tensorflow' before Keras is imported"
+        )
+
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # errors still show
+require_tensorflow_backend(os.environ.get("KERAS_BACKEND", "tensorflow"))
+with _native_stderr_silenced():
+    import keras
+    import tensorflow as tf
+require_tensorflow_backend(keras.backend.backend())
+
+__all__ = ["keras", "require_xla", "tf"]
 
 
 @functools.cache
 def require_xla() -> None:
     """RuntimeError, with what to do, where TensorFlow has no XLA compiler for this machine."""
-    import tensorflow as tf
-
     try:
         _compile_something()
     except tf.errors.OpError as error:
@@ -52,6 +59,4 @@ def require_xla() -> None:
 
 
 def _compile_something() -> None:
-    import tensorflow as tf
-
     tf.function(tf.identity, jit_compile=True)(tf.constant(0.0))

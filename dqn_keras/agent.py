@@ -2,13 +2,13 @@
 
 import dataclasses
 from collections.abc import Hashable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import keras
 import numpy as np
 
+from dqn_keras._tensorflow import keras
 from dqn_keras.config import Config, count
-from dqn_keras.networks import make_networks, renew_weights
+from dqn_keras.networks import copy, make_networks, renew_weights
 from dqn_keras.programs import Learner
 from dqn_keras.replay import ReplayMemory
 
@@ -48,29 +48,64 @@ class Episode(NamedTuple):
     epsilon: float
     """With which it was played."""
     loss: float
-    """Mean over its updates; NaN if it had none."""
+    """Mean over its updates, as are the next three but for max_q; NaN if it had none."""
+    mean_q: float
+    """Mean over a batch of max_a Q(s, a)."""
+    max_q: float
+    """The highest Q-value in any of its batches."""
+    td_error: float
+    """Mean over a batch of |y - Q(s, a)|."""
+    max_reward: float
+    """The highest of one step."""
+    terminated: bool
+    """Whether the environment ended it, not time."""
 
 
-def make_agent(num_features: int, num_actions: int, config: Config, seed: int) -> Agent:
-    """An agent that has seen nothing; weights and random stream follow from `seed` alone."""
-    learner = _recycled.pop((num_features, num_actions, config.hidden_units), None)
-    if learner is None:
-        learner = _make_learner(num_features, num_actions, config, seed)
-    else:
+class DivergedError(ValueError):
+    """The loss or a weight is not finite any more."""
+
+
+def make_agent(
+    state_shape: tuple[int, ...],
+    num_actions: int,
+    config: Config,
+    seed: int,
+    q_network: keras.Model | None = None,
+    dtype: Any = np.float32,
+) -> Agent:
+    """An agent that has seen nothing.
+
+    Weights and random stream follow from `seed` alone, but for the weights of a network that is given.
+    """
+    if q_network is not None:
+        learner = _adopt(q_network, config)
+    elif learner := _recycled.pop((state_shape, num_actions, config.hidden_units), None):  # type: ignore[arg-type]
         _renew(learner, config, seed)
+    else:
+        learner = _make_learner(state_shape, num_actions, config, seed)
     return Agent(
         seed=seed,
         q_network=learner.q_network,
         q_hat_network=learner.q_hat_network,
         optimizer=learner.optimizer,
-        memory=ReplayMemory(config.memory_size, num_features),
+        memory=ReplayMemory(config.memory_size, state_shape, dtype),
         rng=np.random.default_rng(_derived(seed, 1)),
         epsilon=config.epsilon,
     )
 
 
-def _make_learner(num_features: int, num_actions: int, config: Config, seed: int) -> Learner:
-    q_network, q_hat_network = make_networks(num_features, num_actions, config.hidden_units, _derived(seed, 0))
+def _make_learner(state_shape: tuple[int, ...], num_actions: int, config: Config, seed: int) -> Learner:
+    (num_features,) = state_shape
+    networks = make_networks(num_features, num_actions, config.hidden_units, _derived(seed, 0))
+    return _with_optimizer(*networks, config)
+
+
+def _adopt(q_network: keras.Model, config: Config) -> Learner:
+    """A network of someone else's: Q-hat starts as its equal."""
+    return _with_optimizer(q_network, copy(q_network), config)
+
+
+def _with_optimizer(q_network: keras.Model, q_hat_network: keras.Model, config: Config) -> Learner:
     optimizer = keras.optimizers.Adam(learning_rate=config.alpha, name="adam")
     q_network.compile(optimizer=optimizer, loss="mse")  # Keras' callbacks and .keras files look for it there
     optimizer.build(q_network.trainable_variables)
@@ -82,7 +117,7 @@ _recycled: dict[Hashable, Learner] = {}
 
 def recycle(agent: Agent, config: Config) -> None:
     """Give up an agent, and have the next one of its shape made in its networks: to build them takes a while."""
-    _recycled[agent.memory.num_features, agent.q_network.output_shape[-1], config.hidden_units] = agent.learner
+    _recycled[agent.memory.state_shape, agent.q_network.output_shape[-1], config.hidden_units] = agent.learner
 
 
 def _renew(learner: Learner, config: Config, seed: int) -> None:

@@ -15,30 +15,39 @@ import platform
 import re
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import keras
 import numpy as np
-import tensorflow as tf
 from gymnasium.experimental.functional import FuncEnv
 
+from dqn_keras._tensorflow import keras, tf
 from dqn_keras.agent import Agent, Episode
 from dqn_keras.config import Config
-from dqn_keras.networks import check_network
+from dqn_keras.diagnostics import Measures
+from dqn_keras.learn import loss_values
+from dqn_keras.networks import check_network, structure
+from dqn_keras.replay import unpack
 from dqn_keras.version import __version__
 
-FORMAT = 1
+FORMAT = 2
 
 
 class Checkpoints:
     """The checkpoints of one run in a folder of their own, one file each, of which the last two are kept."""
 
-    def __init__(self, folder: str | os.PathLike, env: gym.Env | FuncEnv, config: Config) -> None:
+    def __init__(
+        self,
+        folder: str | os.PathLike,
+        env: gym.Env | FuncEnv,
+        config: Config,
+        q_network: keras.Model | None = None,
+        loss: Callable = loss_values,
+    ) -> None:
         self.folder = Path(folder)
-        self._identity = identity(env, config)
+        self._identity = identity(env, config, q_network, loss)
         self._kept: list[Path] = []  # the newest first, all known to be whole
 
     def paths(self) -> list[Path]:
@@ -90,15 +99,26 @@ class Checkpoints:
         return None
 
 
-def identity(env: gym.Env | FuncEnv, config: Config) -> dict[str, Any]:
+def identity(
+    env: gym.Env | FuncEnv, config: Config, q_network: keras.Model | None = None, loss: Callable = loss_values
+) -> dict[str, Any]:
     """What must be the same for a saved state to be gone on from, as a file holds it (versions may differ)."""
-    facts = {"config": dataclasses.asdict(config), "environment": _describe(env), "versions": _versions()}
+    facts = {
+        "config": dataclasses.asdict(config),
+        "environment": describe(env),
+        "q_network": "the default" if q_network is None else _describe_network(q_network),
+        "loss": _plain(loss),
+        "versions": versions(),
+    }
     return json.loads(json.dumps(facts))  # tuples become lists
 
 
 def check_is_same(path: Path, theirs: dict[str, Any], ours: dict[str, Any], but_for: Sequence[str] = ()) -> None:
-    """ValueError that begins with the field of Config, `env` or `seed` in which `path` is of another run."""
-    theirs, ours = ({**x["config"], "env": x["environment"], "seed": x.get("seed")} for x in (theirs, ours))
+    """ValueError that begins with the argument of `train`, or field of Config, in which `path` is of another run."""
+    theirs, ours = (
+        {**x["config"], "env": x["environment"], **{name: x.get(name) for name in ("q_network", "loss", "seed")}}
+        for x in (theirs, ours)
+    )
     for name in [name for name in ours if name not in but_for]:
         if name not in theirs or theirs[name] != ours[name]:
             raise ValueError(f"{name} is {theirs.get(name)!r} in {path}, got {ours[name]!r}")
@@ -146,13 +166,21 @@ def from_bytes(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 def _arrays(agent: Agent) -> dict[str, Any]:
     """All that is an array, by name."""
-    columns = zip(*(episode[1:] for episode in agent.episodes), strict=True) if agent.episodes else [()] * 4
-    arrays = {f"episodes/{name}": np.array(x, t) for (name, t), x in zip(_COLUMNS.items(), columns, strict=True)}
-    arrays["memory"] = agent.memory.rows[: len(agent.memory)]
-    return {**arrays, **{v.path: v.numpy() for v in agent.learner.variables}}
+    columns = {f"episodes/{x}": np.array([getattr(e, x) for e in agent.episodes], t) for x, t in _COLUMNS.items()}
+    variables = {name: v.numpy() for name, v in _variables(agent).items()}
+    return {**columns, "memory": agent.memory.rows[: len(agent.memory)], **variables}
 
 
-_COLUMNS: dict[str, Any] = {"reward": np.float64, "steps": np.int64, "epsilon": np.float64, "loss": np.float64}
+_COLUMNS: dict[str, Any] = dict.fromkeys(Episode._fields[1:], np.float64) | {"steps": np.int64, "terminated": np.bool_}
+
+
+def _variables(agent: Agent) -> dict[str, keras.Variable]:
+    """By names that do not depend on those of the layers, which Keras numbers through a process."""
+    return {
+        f"{owner}/{i}": variable
+        for owner, part in agent.learner._asdict().items()
+        for i, variable in enumerate(part.variables)
+    }
 
 
 def _facts(agent: Agent) -> dict[str, Any]:
@@ -186,7 +214,9 @@ def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any])
     expected |= {f"episodes/{name}": np.zeros(max(0, num_episodes), dtype) for name, dtype in _COLUMNS.items()}
     expected["memory"] = agent.memory.rows[:num_appended]
     # A run goes on while an average of Adam's overflows, as long as the weights are finite.
-    may_be_infinite = {"episodes/loss", *(v.path for v in agent.optimizer.variables)}
+    may_be_infinite = {f"episodes/{name}" for name in Measures._fields} | {
+        name for name in expected if name.startswith("optimizer/")
+    }
     if names := sorted(expected.keys() ^ arrays.keys()):
         raise DamagedError(f"its arrays are not an agent's: {', '.join(names)} missing or too many")
     for name, array in arrays.items():
@@ -195,7 +225,8 @@ def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any])
             raise DamagedError(
                 f"{name} has shape {array.shape} and dtype {array.dtype}, not {wanted.shape} and {wanted.dtype}"
             )
-        if name not in may_be_infinite and not np.isfinite(array).all():
+        parts = unpack(array, agent.memory.state_shape) if name == "memory" else [array]
+        if name not in may_be_infinite and not all(np.isfinite(x).all() for x in parts):
             raise DamagedError(f"{name} holds a number that is not finite")
     if arrays["episodes/steps"].sum() != num_appended or not 0 <= epsilon <= 1:
         raise DamagedError("its counts do not belong together")
@@ -205,11 +236,17 @@ def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any])
     agent.memory.rows[: len(arrays["memory"])] = arrays["memory"]
     agent.memory.num_appended, agent.num_updates = num_appended, facts["num_updates"]
     agent.seed, agent.epsilon, agent.rng = facts["seed"], epsilon, rng
-    for variable in agent.learner.variables:
-        variable.assign(arrays[variable.path])
+    for name, variable in _variables(agent).items():
+        variable.assign(arrays[name])
 
 
-def _describe(env: gym.Env | FuncEnv) -> dict[str, Any]:
+def _describe_network(network: keras.Model) -> str:
+    """The kinds of its layers, and a digest of all that it is configured to be."""
+    layers = ", ".join(type(layer).__name__ for layer in network.layers)
+    return f"{layers} ({hashlib.sha256(structure(network).encode()).hexdigest()[:12]})"
+
+
+def describe(env: gym.Env | FuncEnv) -> dict[str, Any]:
     """What makes it this environment, as far as can be seen; `render_mode` does not.
 
     Of a registered one its id and arguments, of any other the constructor's arguments that it keeps under their names.
@@ -254,7 +291,7 @@ def _plain(value: Any) -> Any:
     return getattr(value, "__qualname__", type(value).__qualname__)
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
     """What the last bits of a result may depend on."""
     modules = {"tensorflow": tf, "keras": keras, "numpy": np, "gymnasium": gym}
     versions = {name: module.__version__ for name, module in modules.items()}

@@ -7,24 +7,30 @@ up to that update. Nothing random outlives a turn: its draws follow from the run
 import math
 import time
 from collections.abc import Callable, Generator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import tensorflow as tf
 from gymnasium.experimental.functional import FuncEnv
 
-from dqn_keras._tensorflow import require_xla
-from dqn_keras.agent import Agent, Episode, draws_key
+from dqn_keras._tensorflow import require_xla, tf
+from dqn_keras.agent import Agent, DivergedError, Episode, draws_key
 from dqn_keras.config import Config
+from dqn_keras.diagnostics import Measures, measured_step
 from dqn_keras.environment import Spaces, check_spaces
-from dqn_keras.learn import gradient_step
+from dqn_keras.learn import loss_values
+from dqn_keras.networks import is_all_finite
 from dqn_keras.policy import decay_epsilon
 from dqn_keras.programs import Learner, bind
-from dqn_keras.replay import unpack
+from dqn_keras.replay import Experience, pack, unpack
 
 
 def episodes(
-    env: FuncEnv, spaces: Spaces, agent: Agent, config: Config, episodes_per_call: int = 100
+    env: FuncEnv,
+    spaces: Spaces,
+    agent: Agent,
+    config: Config,
+    episodes_per_call: int = 100,
+    loss: Callable = loss_values,
 ) -> Generator[Episode, None, None]:
     """Play and learn, episode after episode, until the run's last; `agent` is changed in place.
 
@@ -35,7 +41,7 @@ def episodes(
     memory = agent.memory
     rows = tf.Variable(memory.rows)
     num_appended = tf.Variable(memory.num_appended, dtype=tf.int32)
-    program = _bind_program(env, spaces, agent, config, episodes_per_call, (rows, num_appended))
+    program = _bind_program(env, spaces, agent, config, episodes_per_call, loss, (rows, num_appended))
 
     at_once = 1
     while (first := len(agent.episodes)) < config.num_episodes:
@@ -50,20 +56,22 @@ def episodes(
 
         numbers = draws_key(agent.seed), np.int32(first), np.int32(num_episodes)
         arguments = (*numbers, np.array(epsilons, np.float32), recent)
-        results = [x.numpy() for x in program(*map(tf.constant, arguments))]
-        played, rewards, steps, losses, updates, fault = results
+        played, *columns, fault = [x.numpy() for x in program(*map(tf.constant, arguments))]
+        facts = _Facts(*columns)
         memory.rows[:] = rows.numpy()
         memory.num_appended = int(num_appended.numpy())
-        agent.num_updates += int(updates.sum())
+        agent.num_updates += int(facts.updates.sum())
         agent.epsilon = decay_epsilon(epsilons[played - 1], config)
         if fault:
-            where = f"step {steps[played - 1] - 1}" if steps[played - 1] else "at the reset"
-            raise ValueError(
-                f"env {type(env).__name__}: {_FAULTS[fault]} was not finite in episode {first + played - 1}, {where}"
+            steps = facts.steps[played - 1]
+            raise (DivergedError if fault == _DIVERGED else ValueError)(
+                f"env {type(env).__name__}: {_FAULTS[fault]} was not finite in episode {first + played - 1}, "
+                + (f"step {steps - 1}" if steps else "at the reset")
             )
-        for i in range(played):
-            loss = float(losses[i] / updates[i]) if updates[i] else math.nan
-            agent.episodes.append(Episode(first + i, float(rewards[i]), int(steps[i]), epsilons[i], loss))
+        agent.episodes += [
+            facts.episode(i, number, epsilon)
+            for i, (number, epsilon) in enumerate(zip(range(first, first + played), epsilons, strict=False))
+        ]
         seconds = time.perf_counter() - start
         at_once = max(1, min(episodes_per_call, int(played * _SECONDS_PER_CALL / seconds)))
         yield from agent.episodes[first:]
@@ -78,11 +86,13 @@ def _bind_program(
     agent: Agent,
     config: Config,
     episodes_per_call: int,
+    loss: Callable,
     variables: tuple[tf.Variable, ...],
 ) -> Callable[..., list[tf.Tensor]]:
     constants = vars(env).items()
     is_like_its_class = all(x is None or isinstance(x, int | float | str) for _, x in constants)
-    key = ("episodes", type(env), tuple(sorted(constants)) if is_like_its_class else env, config, episodes_per_call)
+    environment = tuple(sorted(constants)) if is_like_its_class else env
+    key = ("episodes", type(env), environment, config, episodes_per_call, loss)
     specs = (
         tf.TensorSpec((), tf.int64),
         tf.TensorSpec((), tf.int32),
@@ -92,7 +102,7 @@ def _bind_program(
     )
 
     def make_program(learner: Learner, variables: list[tf.Variable]) -> Callable:
-        return _Program(env, spaces, config, learner, *variables).play
+        return _Program(env, spaces, config, loss, learner, *variables).play
 
     return bind(key, make_program, specs, agent.learner, variables, jit_compile=True)
 
@@ -140,6 +150,27 @@ _NEXT_ATTEMPT = 2**32  # above every turn's number
 
 
 _FAULTS = ("nothing", "an observation", "a reward", "the loss or a weight")
+_DIVERGED = 3
+
+
+class _Facts(NamedTuple):
+    """What comes out of the program: of one episode, or, with a leading axis, of several."""
+
+    reward: Any  # float64
+    steps: Any  # int32
+    sums: Any  # [3] float32, over the updates, of loss, mean_q, td_error
+    max_q: Any  # float32
+    max_reward: Any  # float32
+    updates: Any  # int32
+    terminated: Any  # bool
+
+    def episode(self, i: int, number: int, epsilon: float) -> Episode:
+        """The record of episode `i` of several."""
+        fact = _Facts(*(x[i].tolist() for x in self))
+        loss, mean_q, td_error = (x / fact.updates if fact.updates else math.nan for x in fact.sums)
+        max_q = fact.max_q if fact.updates else math.nan
+        measures = (loss, mean_q, max_q, td_error, fact.max_reward)
+        return Episode(number, fact.reward, fact.steps, epsilon, *measures, fact.terminated)
 
 
 class _Program:
@@ -150,112 +181,122 @@ class _Program:
         env: FuncEnv,
         spaces: Spaces,
         config: Config,
+        loss: Callable,
         learner: Learner,
         rows: tf.Variable,
         num_appended: tf.Variable,
     ) -> None:
-        self._env, self._spaces, self._config, self._learner = env, spaces, config, learner
+        self._env, self._spaces, self._config, self._loss, self._learner = env, spaces, config, loss, learner
         self._rows, self._num_appended = rows, num_appended
         self._max_steps = min(config.max_steps, getattr(env, "max_episode_steps", config.max_steps))
 
     def play(
         self, key: tf.Tensor, first: tf.Tensor, num_episodes: tf.Tensor, epsilons: tf.Tensor, recent: tf.Tensor
     ) -> tuple[tf.Tensor, ...]:
-        """The program: -> episodes played, and of each its reward, steps, sum of losses and updates; the fault."""
+        """The program: -> episodes played, the _Facts of each, the fault."""
         capacity, window = epsilons.shape[0], recent.shape[0]
 
-        def is_to_go_on(i: tf.Tensor, rewards: tf.Tensor, *others: tf.Tensor) -> tf.Tensor:
+        def is_to_go_on(i: tf.Tensor, facts: _Facts, fault: tf.Tensor) -> tf.Tensor:
             # A little below the bound, so that `train`, which decides, is asked wherever rounding could matter.
-            may_be_solved = tf.reduce_mean(rewards[i : i + window]) > self._config.solved_reward - 1e-6
-            return (i < num_episodes) & (others[-1] == 0) & ~((i > 0) & may_be_solved)
+            may_be_solved = tf.reduce_mean(facts.reward[i : i + window]) > self._config.solved_reward - 1e-6
+            return (i < num_episodes) & (fault == 0) & ~((i > 0) & may_be_solved)
 
-        def play_one(i: tf.Tensor, rewards: tf.Tensor, *others: tf.Tensor) -> tuple[tf.Tensor, ...]:
-            *facts, _ = others
-            reward, *new, fault = self._play_episode(episode_key(key, first + i), epsilons[i])
-            facts = [tf.tensor_scatter_nd_update(x, [[i]], [fact]) for x, fact in zip(facts, new, strict=True)]
-            rewards = tf.tensor_scatter_nd_update(rewards, [[i + window]], [reward])
-            return i + 1, rewards, *facts, fault
+        def play_one(i: tf.Tensor, facts: _Facts, _: tf.Tensor) -> tuple[tf.Tensor, _Facts, tf.Tensor]:
+            new, fault = self._play_episode(episode_key(key, first + i), epsilons[i])
+            places = _Facts(*[i] * len(new))._replace(reward=i + window)
+            parts = zip(facts, places, new, strict=True)
+            return i + 1, _Facts(*(tf.tensor_scatter_nd_update(x, [[k]], [y]) for x, k, y in parts)), fault
 
-        counts = tf.zeros([capacity], tf.int32)
+        integers, floats = tf.zeros([capacity], tf.int32), tf.zeros([capacity])
         rewards = tf.concat([recent, tf.zeros([capacity], tf.float64)], axis=0)
-        start = (tf.constant(0), rewards, counts, tf.zeros([capacity]), counts, tf.constant(0))
-        played, rewards, *facts = tf.while_loop(is_to_go_on, play_one, start)
-        return played, rewards[window:], *facts
+        facts = _Facts(rewards, integers, tf.zeros([capacity, 3]), floats, floats, integers, integers > 0)
+        played, facts, fault = tf.while_loop(is_to_go_on, play_one, (tf.constant(0), facts, tf.constant(0)))
+        return played, *facts._replace(reward=facts.reward[window:]), fault
 
-    def _play_episode(self, key: tf.Tensor, epsilon: tf.Tensor) -> tuple[tf.Tensor, ...]:
-        """-> its reward, steps, sum of losses, updates, and what was not finite in it, an index of _FAULTS."""
+    def _play_episode(self, key: tf.Tensor, epsilon: tf.Tensor) -> tuple[_Facts, tf.Tensor]:
+        """-> what it was like, and what was not finite in it, an index of _FAULTS."""
         n, batch_size, memory_size = self._config.steps_per_update, self._config.batch_size, self._config.memory_size
 
-        def turn(state: Any, is_over: tf.Tensor, reward: tf.Tensor, steps: tf.Tensor, *sums: tf.Tensor) -> tuple:
-            loss, updates, fault = sums
-            number = (steps + n - 1) // n  # turn 0 is step 0, turn k the n steps up to step k n
+        def turn(state: Any, is_over: tf.Tensor, facts: _Facts, fault: tf.Tensor) -> tuple[Any, ...]:
+            number = (facts.steps + n - 1) // n  # turn 0 is step 0, turn k the n steps up to step k n
             bits = draw_bits(2 * n + batch_size, key, number)
 
             def step(
-                state: Any, is_over: tf.Tensor, reward: tf.Tensor, t: tf.Tensor, _: Any, __: Any
+                state: Any, is_over: tf.Tensor, reward: tf.Tensor, most: tf.Tensor, t: tf.Tensor, *_: tf.Tensor
             ) -> tuple[Any, ...]:
                 j = (t + n - 1) % n
                 rng = tf.stack([key, -1 - tf.cast(t, tf.int64)])
-                state, new_reward, is_end, fault = self._step(state, epsilon, bits[j], bits[n + j], rng)
-                is_over = is_end | (t + 1 >= self._max_steps) | (fault > 0)
-                return state, is_over, reward + tf.cast(new_reward, tf.float64), t + 1, t % n == 0, fault
+                state, new_reward, terminated, fault = self._step(state, epsilon, bits[j], bits[n + j], rng)
+                is_over = terminated | (t + 1 >= self._max_steps) | (fault > 0)
+                reward, most = reward + tf.cast(new_reward, tf.float64), tf.maximum(most, new_reward)
+                return state, is_over, reward, most, t + 1, t % n == 0, terminated, fault
 
-            start = (state, is_over, reward, steps, tf.constant(False), fault)
-            state, is_over, reward, steps, is_update, fault = tf.while_loop(
-                lambda state, is_over, reward, t, is_update, fault: ~is_over & ~is_update, step, start
+            start = (state, is_over, facts.reward, facts.max_reward, facts.steps, False, facts.terminated, fault)
+            state, is_over, reward, max_reward, steps, is_update, terminated, fault = tf.while_loop(
+                lambda state, is_over, reward, most, t, is_update, *_: ~is_over & ~is_update,
+                step,
+                tf.nest.map_structure(tf.convert_to_tensor, start),
             )
 
             is_update &= (fault == 0) & (self._num_appended >= batch_size)
             size = tf.minimum(self._num_appended, memory_size)
-            new_loss, is_finite = tf.cond(
+            loss, mean_q, max_q, td_error = tf.cond(
                 is_update,
                 lambda: self._update(sample_indices(bits[2 * n :], key, number, size)),
-                lambda: (tf.constant(0.0), tf.constant(True)),
+                lambda: _NO_UPDATE,
             )
-            fault = tf.where(is_finite, fault, 3)
-            sums = (loss + new_loss, updates + tf.cast(is_update, tf.int32), fault)
-            return state, is_over | ~is_finite, reward, steps, *sums
+            fault = tf.where(tf.math.is_finite(loss), fault, _DIVERGED)
+            facts = _Facts(
+                reward,
+                steps,
+                facts.sums + tf.stack([loss, mean_q, td_error]),
+                tf.maximum(facts.max_q, max_q),
+                max_reward,
+                facts.updates + tf.cast(is_update, tf.int32),
+                terminated,
+            )
+            return state, is_over | (fault > 0), facts, fault
 
         rng = tf.stack([key, tf.constant(-(2**62), tf.int64)])
         state = self._env.initial(rng)
-        observation = tf.cast(self._env.observation(state, rng), tf.float32)
-        zero, fault = tf.constant(0), tf.where(is_all_finite(observation), 0, 1)
-        start = ((state, observation), fault > 0, tf.constant(0, tf.float64), zero, tf.constant(0.0), zero, fault)
-        _, _, *sums = tf.while_loop(lambda state, is_over, *_: ~is_over, turn, start)
-        return tuple(sums)
+        observation = self._observation(state, rng)
+        fault = tf.where(is_all_finite(observation), 0, 1)
+        zero, least = tf.constant(0), tf.constant(-math.inf)
+        facts = _Facts(tf.constant(0, tf.float64), zero, tf.zeros([3]), least, least, zero, tf.constant(False))
+        start = ((state, observation), fault > 0, facts, fault)
+        _, _, facts, fault = tf.while_loop(lambda state, is_over, *_: ~is_over, turn, start)
+        return facts, fault
 
     def _step(
         self, state: Any, epsilon: tf.Tensor, bits: tf.Tensor, action_bits: tf.Tensor, rng: tf.Tensor
-    ) -> tuple[Any, tf.Tensor, tf.Tensor, tf.Tensor]:
+    ) -> tuple[tuple, tf.Tensor, tf.Tensor, tf.Tensor]:
         """One env step, remembered: -> next state, reward, terminated, fault. A state goes with its observation."""
         env, first_action = self._env, self._spaces.first_action
-        state, observation = state  # [F] float32
+        state, observation = state  # [*S]
         greedy = tf.argmax(self._learner.q_network(observation[None])[0], output_type=tf.int32)
         a = tf.where(to_uniform(bits) < epsilon, to_integer(action_bits, self._spaces.num_actions), greedy)
 
         next_state = env.transition(state, a + first_action, rng)
-        next_observation = tf.cast(env.observation(next_state, rng), tf.float32)
+        next_observation = self._observation(next_state, rng)
         reward = tf.cast(env.reward(state, a + first_action, next_state, rng), tf.float32)
         terminated = tf.cast(env.terminal(next_state, rng), tf.bool)
 
-        scalars = tf.stack([tf.cast(a, tf.float32), reward, tf.cast(terminated, tf.float32)])
-        row = tf.concat([observation, next_observation, scalars], axis=0)
+        row = pack(Experience(observation, a, reward, next_observation, terminated))
         self._rows.scatter_nd_update([[self._num_appended % self._config.memory_size]], row[None])
         self._num_appended.assign_add(1)
 
         fault = tf.where(is_all_finite(next_observation), tf.where(tf.math.is_finite(reward), 0, 2), 1)
         return (next_state, next_observation), reward, terminated, fault
 
-    def _update(self, indices: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
-        """-> the loss, and whether it and the new weights are finite."""
-        batch = unpack(tf.gather(self._rows, indices), self._spaces.num_features)
-        loss = gradient_step(batch, self._config.gamma, *self._learner, self._config.tau)
-        return loss, is_all_finite(loss, *self._learner.q_network.weights)
+    def _observation(self, state: Any, rng: tf.Tensor) -> tf.Tensor:
+        return tf.cast(self._env.observation(state, rng), self._spaces.state_dtype)
+
+    def _update(self, indices: tf.Tensor) -> Measures:
+        batch = unpack(tf.gather(self._rows, indices), self._spaces.state_shape)
+        return measured_step(batch, self._learner, self._config, self._loss)
 
 
-def is_all_finite(*tensors: tf.Tensor) -> tf.Tensor:
-    """A boolean scalar."""
-    return tf.reduce_all([tf.reduce_all(tf.math.is_finite(x)) for x in tensors])
+_NO_UPDATE = Measures(loss=0.0, mean_q=0.0, max_q=-math.inf, td_error=0.0)
 
 
 def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:
@@ -277,7 +318,7 @@ def check_functional(env: FuncEnv) -> Spaces:
     if specs[0] != specs[1]:
         raise ValueError(f"env {name}: transition must return a state like initial's, {specs[0]}, got {specs[1]}")
     for part, value, shape in [
-        ("observation", env.observation(state, rng), (spaces.num_features,)),
+        ("observation", env.observation(state, rng), spaces.state_shape),
         ("reward", env.reward(state, tf.constant(spaces.first_action), next_state, rng), ()),
         ("terminal", env.terminal(state, rng), ()),
     ]:

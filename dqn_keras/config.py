@@ -117,7 +117,7 @@ def counts(name: str, values: Any) -> tuple[int, ...]:
     if isinstance(values, np.ndarray) and values.ndim == 1:
         values = list(values)
     if isinstance(values, str | bytes) or not isinstance(values, Sequence):
-        raise TypeError(f"{name} must be a tuple of whole numbers, one per hidden layer, got {values!r}")
+        raise TypeError(f"{name} must be a tuple of whole numbers, got {values!r}")
     if not values:
-        raise ValueError(f"{name} must name at least one hidden layer, got {values!r}")
+        raise ValueError(f"{name} must hold at least one whole number, got {values!r}")
     return tuple(count(f"{name}[{i}]", value) for i, value in enumerate(values))

@@ -9,9 +9,9 @@ import numpy as np
 
 
 class CheckedEnv:
-    """A gymnasium.Env with a Box observation of one axis and Discrete actions, its words checked.
+    """A gymnasium.Env with Box observations and Discrete actions, its words checked.
 
-    States come out as float32 copies [F] (an environment may reuse its buffer), actions go in as indices from 0.
+    States come out as copies [*S] (an environment may reuse its buffer), actions go in as indices from 0.
     Whatever else comes raises ValueError with the environment's name, the episode and the step.
     """
 
@@ -21,7 +21,7 @@ class CheckedEnv:
         self.name = env.spec.id if env.spec else type(env.unwrapped).__name__
         self.spaces = check_spaces(self.name, env.observation_space, env.action_space)
         self._env = env
-        self._shape = (self.spaces.num_features,)
+        self._is_uint8 = self.spaces.state_dtype == np.uint8
 
     def reset(self, seed: int, episode: int) -> np.ndarray:
         """Begin an episode with the environment seeded: its first state. The number is for messages."""
@@ -52,12 +52,15 @@ class CheckedEnv:
 
     def _checked_state(self, observation: Any) -> np.ndarray:
         try:
-            state = np.array(observation, np.float32)
+            state = np.array(observation, None if self._is_uint8 else np.float32)
         except (TypeError, ValueError):
             raise self._error("the observation must be an array of numbers", observation) from None
-        if state.shape != self._shape:
-            raise self._error(f"the observation must have shape {self._shape}", observation)
-        if not math.isfinite(sum(state.tolist())):  # in float64, where float32 numbers cannot overflow
+        if state.shape != self.spaces.state_shape:
+            raise self._error(f"the observation must have shape {self.spaces.state_shape}", observation)
+        if self._is_uint8:
+            if state.dtype != np.uint8:
+                raise self._error("the observation must be of dtype uint8, as its space says", state.dtype)
+        elif not (math.isfinite(sum(state.tolist())) if state.ndim == 1 else np.isfinite(state).all()):
             raise self._error("the observation must be finite in float32", observation)
         return state
 
@@ -78,7 +81,9 @@ class CheckedEnv:
 class Spaces(NamedTuple):
     """What a network must know of an environment."""
 
-    num_features: int
+    state_shape: tuple[int, ...]
+    state_dtype: np.dtype
+    """uint8 where the observations are that, as images are; float32 for all others."""
     num_actions: int
     first_action: int
     """What the environment calls the action of index 0."""
@@ -86,14 +91,15 @@ class Spaces(NamedTuple):
 
 def check_spaces(name: str, observations: gym.Space, actions: gym.Space) -> Spaces:
     """The sizes of the two spaces; ValueError if they are not supported."""
-    if not isinstance(observations, gym.spaces.Box) or len(observations.shape) != 1 or not observations.shape[0]:
+    if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         raise ValueError(
-            f"env {name} has the observation space {observations}; supported is a Box of one axis "
-            "(gymnasium.wrappers.FlattenObservation makes one of most spaces)"
+            f"env {name} has the observation space {observations}; supported is a Box of at least one axis "
+            "(gymnasium.wrappers.FlattenObservation(env) makes one of most spaces, Discrete ones included)"
         )
     if not isinstance(actions, gym.spaces.Discrete):
         raise ValueError(f"env {name} has the action space {actions}; supported is Discrete")
-    return Spaces(observations.shape[0], int(actions.n), int(actions.start))
+    dtype = np.dtype(np.uint8 if observations.dtype == np.uint8 else np.float32)
+    return Spaces(observations.shape, dtype, int(actions.n), int(actions.start))
 
 
 _BOOLS = (bool, np.bool_)

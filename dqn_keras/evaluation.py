@@ -1,9 +1,9 @@
 """Greedy episodes: what the network is worth without exploration."""
 
 import gymnasium as gym
-import keras
 import numpy as np
 
+from dqn_keras._tensorflow import keras
 from dqn_keras.agent import checked_seed, evaluation_seed
 from dqn_keras.config import count
 from dqn_keras.environment import CheckedEnv
@@ -26,7 +26,7 @@ def evaluate(
         TypeError, ValueError: as for `train`; or the network does not fit the environment.
     """
     checked_env = CheckedEnv(env)
-    check_fits(q_network, checked_env.spaces.num_features, checked_env.spaces.num_actions)
+    check_fits(q_network, checked_env.spaces.state_shape, checked_env.spaces.num_actions)
     num_episodes, max_steps, seed = (
         count("num_episodes", num_episodes),
         count("max_steps", max_steps),

@@ -1,7 +1,8 @@
-"""Episodes in any gymnasium.Env with a flat observation and discrete actions, one step at a time.
+"""Episodes in any gymnasium.Env with Box observations and discrete actions, one step at a time.
 
-Acting runs in NumPy and learning is one compiled call per update: a TensorFlow call costs more than a step of
-CartPole and the forward pass of its network together, so the loop makes as few of them as it can.
+Acting runs in NumPy, where the network is one that NumPy can compute, and learning is one compiled call per update: a
+TensorFlow call costs more than a step of CartPole and the forward pass of its network together, so the loop makes as
+few of them as it can.
 """
 
 import math
@@ -9,78 +10,123 @@ from collections.abc import Callable, Generator
 from typing import Any
 
 import numpy as np
-import tensorflow as tf
 
-from dqn_keras.agent import Agent, Episode, episode_seed
+from dqn_keras._tensorflow import tf
+from dqn_keras.agent import Agent, DivergedError, Episode, episode_seed
 from dqn_keras.config import Config
+from dqn_keras.diagnostics import Measures, measured_step, sum_up
 from dqn_keras.environment import CheckedEnv
-from dqn_keras.learn import gradient_step
-from dqn_keras.networks import q_values
+from dqn_keras.learn import loss_values
+from dqn_keras.networks import is_relu_mlp, q_values
 from dqn_keras.policy import action, decay_epsilon
 from dqn_keras.programs import Learner, bind
 from dqn_keras.replay import Experience, unpack
 
 
-def episodes(env: CheckedEnv, agent: Agent, config: Config) -> Generator[Episode, None, None]:
+def episodes(
+    env: CheckedEnv, agent: Agent, config: Config, loss: Callable = loss_values
+) -> Generator[Episode, None, None]:
     """Play and learn, episode after episode, until the run's last; `agent` is changed in place."""
-    update = _bind_update(agent, config)
+    q = _InNumPy(agent, config, loss) if is_relu_mlp(agent.q_network) else _InTensorFlow(agent, config, loss)
     while len(agent.episodes) < config.num_episodes:
-        agent.episodes.append(_play_episode(env, agent, config, update))
+        agent.episodes.append(_play_episode(env, agent, config, q))
         yield agent.episodes[-1]
 
 
-def _play_episode(env: CheckedEnv, agent: Agent, config: Config, update: Callable) -> Episode:
+def _play_episode(env: CheckedEnv, agent: Agent, config: Config, q: "_InNumPy | _InTensorFlow") -> Episode:
     number, epsilon, memory, rng = len(agent.episodes), agent.epsilon, agent.memory, agent.rng
-    weights = agent.q_network.get_weights()  # anew each episode: a callback may have changed them
-    total_reward, losses, t = 0.0, [], 0
+    total_reward, max_reward, measures, t, terminated = 0.0, -math.inf, [], 0, False
+    q.read_weights()
 
     state = env.reset(episode_seed(agent.seed, number), number)
     for t in range(config.max_steps):
-        a = action(q_values(weights, state), epsilon, rng)
+        a = action(q.values(state), epsilon, rng)
         next_state, reward, terminated, truncated = env.step(a)
         memory.append(Experience(state, a, reward, next_state, terminated))
         total_reward += reward
+        max_reward = max(max_reward, reward)
 
         if t % config.steps_per_update == 0 and len(memory) >= config.batch_size:
-            loss, weights = update(memory.sample_rows(config.batch_size, rng))
-            if not math.isfinite(loss):
-                raise ValueError(
+            measures.append(q.update(memory.sample_rows(config.batch_size, rng)))
+            if not math.isfinite(measures[-1].loss):
+                raise DivergedError(
                     f"the loss or a weight is not finite in episode {number}, step {t}: learning has diverged"
                 )
-            losses.append(loss)
 
         state = next_state
         if terminated or truncated:
             break
 
-    agent.num_updates += len(losses)
+    agent.num_updates += len(measures)
     agent.epsilon = decay_epsilon(epsilon, config)
-    return Episode(number, total_reward, t + 1, epsilon, sum(losses) / len(losses) if losses else math.nan)
+    loss, mean_q, max_q, td_error = sum_up(measures)
+    return Episode(number, total_reward, t + 1, epsilon, loss, mean_q, max_q, td_error, max_reward, terminated)
 
 
-def _bind_update(agent: Agent, config: Config) -> Callable[[np.ndarray], tuple[float, list[np.ndarray]]]:
-    """The gradient step on rows of the memory, [B, 2F + 3] -> its loss and Q's new weights, ready to act with.
+class _InNumPy:
+    """Q, computed in NumPy with the weights that the last update has given back."""
+
+    def __init__(self, agent: Agent, config: Config, loss: Callable) -> None:
+        self._network = agent.q_network
+        self._shapes = [tuple(w.shape) for w in agent.q_network.weights]
+        num_measures = len(Measures._fields)
+        self._ends = np.cumsum([num_measures] + [math.prod(shape) for shape in self._shapes]).tolist()
+        self._step = _bind_step(agent, config, loss, gives_weights=True)
+
+    def read_weights(self) -> None:
+        """Anew at each episode: a callback may have changed them."""
+        self._weights = self._network.get_weights()
+
+    def values(self, state: np.ndarray) -> np.ndarray:
+        """Q(s, .), [A]."""
+        return q_values(self._weights, state)
+
+    def update(self, rows: np.ndarray) -> Measures:
+        """A gradient step on rows of the memory."""
+        flat = self._step(tf.constant(rows))[0].numpy()
+        parts = zip(self._ends, self._ends[1:], self._shapes, strict=False)
+        self._weights = [flat[i:j].reshape(shape) for i, j, shape in parts]
+        return Measures(*flat[: self._ends[0]].tolist())
+
+
+class _InTensorFlow:
+    """The same for any other network, a TensorFlow call per step."""
+
+    def __init__(self, agent: Agent, config: Config, loss: Callable) -> None:
+        def make_values(learner: Learner, _: Any) -> Callable[[tf.Tensor], tf.Tensor]:
+            return lambda state: learner.q_network(state[None])[0]
+
+        state = tf.TensorSpec(agent.memory.state_shape, agent.memory.rows.dtype)
+        self._values = bind("values", make_values, [state], agent.learner, jit_compile=config.jit_compile)
+        self._step = _bind_step(agent, config, loss, gives_weights=False)
+
+    def read_weights(self) -> None:
+        """They are where they are."""
+
+    def values(self, state: np.ndarray) -> np.ndarray:
+        """Q(s, .), [A]."""
+        return self._values(tf.constant(state))[0].numpy()
+
+    def update(self, rows: np.ndarray) -> Measures:
+        """A gradient step on rows of the memory."""
+        return Measures(*self._step(tf.constant(rows))[0].numpy().tolist())
+
+
+def _bind_step(agent: Agent, config: Config, loss: Callable, gives_weights: bool) -> Callable[..., list[tf.Tensor]]:
+    """The gradient step on rows of the memory -> its measures and, if asked for, Q's new weights, all in one vector.
 
     One array goes in and one comes out: each further one costs as much as its share of the arithmetic.
     """
-    num_features = agent.memory.num_features
-    shapes = [tuple(w.shape) for w in agent.q_network.weights]
-    ends = np.cumsum([1] + [math.prod(shape) for shape in shapes]).tolist()
+    rows, state_shape = agent.memory.rows, agent.memory.state_shape
 
     def make_step(learner: Learner, _: Any) -> Callable[[tf.Tensor], tf.Tensor]:
         def step(rows: tf.Tensor) -> tf.Tensor:
-            loss = gradient_step(unpack(rows, num_features), config.gamma, *learner, config.tau)
-            return tf.concat([loss[None], *(tf.reshape(w, [-1]) for w in learner.q_network.weights)], axis=0)
+            measures = measured_step(unpack(rows, state_shape), learner, config, loss)
+            weights = learner.q_network.weights if gives_weights else ()
+            return tf.concat([tf.stack(measures), *(tf.reshape(w, [-1]) for w in weights)], axis=0)
 
         return step
 
-    rows_spec = tf.TensorSpec((config.batch_size, agent.memory.rows.shape[1]))
-    key = ("update", config.gamma, config.tau)
-    step = bind(key, make_step, [rows_spec], agent.learner, jit_compile=config.jit_compile)
-
-    def update(rows: np.ndarray) -> tuple[float, list[np.ndarray]]:
-        flat = step(tf.constant(rows))[0].numpy()
-        weights = [flat[i:j].reshape(shape) for i, j, shape in zip(ends, ends[1:], shapes, strict=False)]
-        return (float(flat[0]) if np.isfinite(flat).all() else math.nan), weights
-
-    return update
+    specs = [tf.TensorSpec((config.batch_size, rows.shape[1]), rows.dtype)]
+    key = ("update", config.gamma, config.tau, state_shape, loss, gives_weights)
+    return bind(key, make_step, specs, agent.learner, jit_compile=config.jit_compile)

@@ -8,18 +8,14 @@ import weakref
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
-import keras
-import tensorflow as tf
-
+from dqn_keras._tensorflow import keras, tf
 from dqn_keras.networks import check_network
 from dqn_keras.programs import Learner, bind
-from dqn_keras.replay import as_batch, as_share
+from dqn_keras.replay import Experience, as_batch, as_share
 
 
-def loss_values(
-    experiences: Sequence[Any], gamma: Any, q_network: keras.Model, q_hat_network: keras.Model
-) -> tf.Tensor:
-    """Mean squared temporal-difference error of a batch: mean of (y - Q(s, a))^2, a scalar.
+def td_errors(experiences: Sequence[Any], gamma: Any, q_network: keras.Model, q_hat_network: keras.Model) -> tf.Tensor:
+    """Temporal-difference errors of a batch: y - Q(s, a) of each transition, [B].
 
     The target is y = r + gamma max_a' Q_hat(s', a'), or y = r where s' is terminal (Mnih et al. 2015, algorithm 1).
 
@@ -41,7 +37,14 @@ def loss_values(
     max_q_hat = tf.reduce_max(q_hat_network(next_states), axis=-1)  # [B]
     targets = rewards + (1 - terminal_states) * gamma * max_q_hat  # [B]
     q_of_actions = tf.gather(q_network(states), actions, batch_dims=1)  # [B]
-    return tf.reduce_mean(tf.square(targets - q_of_actions))
+    return targets - q_of_actions
+
+
+def loss_values(
+    experiences: Sequence[Any], gamma: Any, q_network: keras.Model, q_hat_network: keras.Model
+) -> tf.Tensor:
+    """The loss: the mean of the squared `td_errors`, a scalar. A function of the same form may take its place."""
+    return tf.reduce_mean(tf.square(td_errors(experiences, gamma, q_network, q_hat_network)))
 
 
 def update_q_hat(q_network: keras.Model, q_hat_network: keras.Model, tau: Any = 0.01) -> None:
@@ -58,14 +61,18 @@ def gradient_step(
     q_hat_network: keras.Model,
     optimizer: keras.Optimizer,
     tau: Any,
+    loss: Callable = loss_values,
 ) -> tf.Tensor:
     """One gradient step of the loss with respect to Q alone, then the soft update; returns the loss before it."""
     with tf.GradientTape() as tape:
-        loss = loss_values(experiences, gamma, q_network, q_hat_network)
-    gradients = tape.gradient(loss, q_network.trainable_variables)
+        value = loss(experiences, gamma, q_network, q_hat_network)
+        if not tf.is_tensor(value) or value.shape.rank != 0:
+            got = f"shape {value.shape}" if tf.is_tensor(value) else repr(value)
+            raise ValueError(f"loss must return a scalar tensor, got {got}")
+    gradients = tape.gradient(value, q_network.trainable_variables)
     optimizer.apply_gradients(zip(gradients, q_network.trainable_variables, strict=True))
     update_q_hat(q_network, q_hat_network, tau)
-    return loss
+    return tf.cast(value, tf.float32)
 
 
 def learn(
@@ -76,6 +83,7 @@ def learn(
     optimizer: keras.Optimizer,
     tau: float = 0.01,
     *,
+    loss: Callable = loss_values,
     jit_compile: bool = True,
 ) -> tf.Tensor:
     """Learn from one batch: a gradient step on Q and a soft update of Q-hat, compiled into one call.
@@ -90,6 +98,7 @@ def learn(
         q_hat_network: a second one of the same shape.
         optimizer: any Keras optimizer; built here if it is not.
         tau: share of Q in the soft update.
+        loss: a function of `loss_values`' form: (experiences, gamma, q_network, q_hat_network) -> scalar tensor.
         jit_compile: compile with XLA (faster; its results differ from TensorFlow's own in the last bits).
 
     Returns:
@@ -104,9 +113,9 @@ def learn(
     learner = Learner(q_network, q_hat_network, optimizer)
     if not tf.executing_eagerly():  # in a tf.function of the caller's, which then compiles it
         with tf.init_scope():
-            _prepare(learner)
-        return gradient_step(experiences, gamma, *learner, tau)
-    step = _bound_step(learner, jit_compile)
+            learner.prepare()
+        return gradient_step(experiences, gamma, *learner, tau, loss)
+    step = _bound_step(learner, loss, jit_compile)
     batch = as_batch(experiences, q_network.input_shape[1:], q_network.output_shape[-1])
     gamma, tau = as_share("gamma", gamma), as_share("tau", tau)
     return step(*batch, gamma, tau)[0]
@@ -115,34 +124,19 @@ def learn(
 _bound_steps: dict[Hashable, Callable] = {}
 
 
-def _bound_step(learner: Learner, jit_compile: bool) -> Callable[..., list[tf.Tensor]]:
-    """The compiled `gradient_step` for these three; found at once from the second call on."""
-    key = (*map(id, learner), jit_compile, *map(id, learner.q_network.trainable_variables))
+def _bound_step(learner: Learner, loss: Callable, jit_compile: bool) -> Callable[..., list[tf.Tensor]]:
+    """The compiled `gradient_step` for these; found at once from the second call on."""
+    key = (*map(id, learner), loss, jit_compile, *map(id, learner.q_network.trainable_variables))
     if key not in _bound_steps:
-        _prepare(learner)
+        learner.prepare()
         state = tf.TensorSpec((None, *learner.q_network.input_shape[1:]))  # a batch of any size
         scalar, vector, indices = tf.TensorSpec(()), tf.TensorSpec((None,)), tf.TensorSpec((None,), tf.int32)
         specs = (state, indices, vector, state, vector, scalar, scalar)
-        _bound_steps[key] = bind("learn", _make_step, specs, learner, jit_compile=jit_compile)
+
+        def make_step(learner: Learner, _: Any) -> Callable[..., tf.Tensor]:
+            return lambda *tensors: gradient_step(Experience(*tensors[:5]), tensors[5], *learner, tensors[6], loss)
+
+        _bound_steps[key] = bind(("learn", loss), make_step, specs, learner, jit_compile=jit_compile)
         for owner in learner:  # what is bound holds the agent's variables: it must go when the agent goes
             weakref.finalize(owner, _bound_steps.pop, key, None).atexit = False
     return _bound_steps[key]
-
-
-def _make_step(learner: Learner, _: Any) -> Callable[..., tf.Tensor]:
-    return lambda *tensors: gradient_step(tensors[:5], tensors[5], *learner, tau=tensors[6])
-
-
-def _prepare(learner: Learner) -> None:
-    """Check that the networks belong together, and build the optimizer."""
-    q_network, q_hat_network, optimizer = learner
-    if not isinstance(optimizer, keras.Optimizer):
-        raise TypeError(f"optimizer must be a Keras optimizer, got {optimizer!r}")
-    if q_network is q_hat_network:
-        raise ValueError("q_hat_network must be a second network, got q_network itself")
-    shapes, hat_shapes = ([tuple(w.shape) for w in n.weights] for n in (q_network, q_hat_network))
-    if shapes != hat_shapes:
-        raise ValueError(f"q_hat_network must have weights of q_network's shapes {shapes}, got {hat_shapes}")
-    if not optimizer.built:
-        optimizer.build(q_network.trainable_variables)
-    optimizer._check_variables_are_known(q_network.trainable_variables)  # else ValueError, in Keras' words

@@ -1,14 +1,13 @@
 """The two networks: Q, which learns, and Q-hat, its slow copy that the targets are computed from."""
 
+import json
+import random
 from collections.abc import Callable, Sequence
+from typing import Any
 
-import keras
 import numpy as np
-import tensorflow as tf
-from keras import Sequential
-from keras.initializers import GlorotUniform
-from keras.layers import Dense, Input
 
+from dqn_keras._tensorflow import keras, tf
 from dqn_keras.config import count, counts
 
 
@@ -18,7 +17,7 @@ def make_q_network(
     hidden_units: Sequence[int] = (64,),
     seed: int | np.random.SeedSequence | None = None,
     name: str = "q_network",
-) -> Sequential:
+) -> keras.Sequential:
     """A feed-forward Q-network: states [B, num_features] -> Q-values [B, num_actions], float32.
 
     Hidden layers are ReLU, the output is linear. Kernels start Glorot uniform (Keras' default), drawn
@@ -27,21 +26,24 @@ def make_q_network(
     num_features, num_actions = count("num_features", num_features), count("num_actions", num_actions)
     hidden_units = counts("hidden_units", hidden_units)
     *hidden, output = _initializers(len(hidden_units) + 1, seed)
-    layers: list[keras.Layer] = [Input(shape=(num_features,), dtype="float32")]
+    layers: list[keras.Layer] = [keras.Input(shape=(num_features,), dtype="float32")]
     for i, (units, initializer) in enumerate(zip(hidden_units, hidden, strict=True), start=1):
-        layers.append(
-            Dense(units, activation="relu", kernel_initializer=initializer, dtype="float32", name=f"hidden_{i}")
-        )
-    layers.append(Dense(num_actions, activation="linear", kernel_initializer=output, dtype="float32", name="q_values"))
-    return Sequential(layers, name=name)
+        layers.append(_dense(units, "relu", initializer, f"hidden_{i}"))
+    layers.append(_dense(num_actions, "linear", output, "q_values"))
+    return keras.Sequential(layers, name=name)
 
 
-def _initializers(num_layers: int, seed: int | np.random.SeedSequence | None) -> list[GlorotUniform]:
+def _dense(units: int, activation: str, initializer: keras.initializers.Initializer, name: str) -> keras.layers.Dense:
+    return keras.layers.Dense(units, activation=activation, kernel_initializer=initializer, dtype="float32", name=name)
+
+
+def _initializers(num_layers: int, seed: int | np.random.SeedSequence | None) -> list[keras.initializers.Initializer]:
     """Of the kernels, first to last."""
-    return [GlorotUniform(seed=int(s)) for s in np.random.default_rng(seed).integers(2**31, size=num_layers)]
+    seeds = np.random.default_rng(seed).integers(2**31, size=num_layers)
+    return [keras.initializers.GlorotUniform(seed=int(s)) for s in seeds]
 
 
-def renew_weights(network: Sequential, seed: int | np.random.SeedSequence | None) -> None:
+def renew_weights(network: keras.Sequential, seed: int | np.random.SeedSequence | None) -> None:
     """Give a network of `make_q_network` the weights that it would be made with."""
     weights = []
     for layer, initializer in zip(network.layers, _initializers(len(network.layers), seed), strict=True):
@@ -54,12 +56,43 @@ def make_networks(
     num_actions: int,
     hidden_units: Sequence[int] = (64,),
     seed: int | np.random.SeedSequence | None = None,
-) -> tuple[Sequential, Sequential]:
+) -> tuple[keras.Sequential, keras.Sequential]:
     """Q and Q-hat, of one shape and with equal weights."""
     q_network = make_q_network(num_features, num_actions, hidden_units, seed)
     q_hat_network = make_q_network(num_features, num_actions, hidden_units, seed, name="q_hat_network")
     q_hat_network.set_weights(q_network.get_weights())
     return q_network, q_hat_network
+
+
+def clone(network: keras.Model, clone_layer: Callable[[keras.Layer], keras.Layer] | None = None) -> keras.Model:
+    """A network of the same configuration, its weights its own; no global random state is moved."""
+    state = random.getstate()  # Keras draws from there for initializers without a seed
+    try:
+        return keras.models.clone_model(network, clone_function=clone_layer)
+    finally:
+        random.setstate(state)
+
+
+def structure(network: keras.Model) -> str:
+    """Equal for networks of one configuration, but for names and for initializers, which have done their work."""
+    text = json.dumps(_without_names(network.get_config()), sort_keys=True, default=repr)
+    for i, layer in enumerate(network.layers):  # a functional model's layers refer to each other by name
+        text = text.replace(json.dumps(layer.name), f'"layer {i}"')
+    return text
+
+
+def _without_names(config: Any) -> Any:
+    if isinstance(config, dict):
+        kept = {k: v for k, v in config.items() if k != "name" and not k.endswith("_initializer")}
+        return {k: v if k == "dtype" else _without_names(v) for k, v in kept.items()}
+    return [_without_names(x) for x in config] if isinstance(config, list | tuple) else config
+
+
+def copy(network: keras.Model) -> keras.Model:
+    """A second network, equal to the first."""
+    second = clone(network)
+    second.set_weights(network.get_weights())
+    return second
 
 
 def q_values(weights: Sequence[np.ndarray], state: np.ndarray) -> np.ndarray:
@@ -94,9 +127,11 @@ def q_function(q_network: keras.Model) -> Callable[[np.ndarray], np.ndarray]:
 
 def is_relu_mlp(q_network: keras.Model) -> bool:
     """Whether `q_values` computes this network: dense layers, ReLU but for a linear last one."""
-    if not isinstance(q_network, Sequential):
+    if not isinstance(q_network, keras.Sequential):
         return False
-    if not all(type(x) is Dense and len(x.weights) == 2 and x.compute_dtype == "float32" for x in q_network.layers):
+    if not all(
+        type(x) is keras.layers.Dense and len(x.weights) == 2 and x.compute_dtype == "float32" for x in q_network.layers
+    ):
         return False
     *hidden, output = [layer.activation for layer in q_network.layers]
     return all(x is keras.activations.relu for x in hidden) and output is keras.activations.linear
@@ -104,20 +139,33 @@ def is_relu_mlp(q_network: keras.Model) -> bool:
 
 def check_network(name: str, network: keras.Model) -> None:
     """TypeError or ValueError if it is not a Sequential or functional model that has been built."""
-    if not isinstance(network, Sequential | keras.models.Model):
+    if not isinstance(network, keras.Sequential | keras.models.Model):
         raise TypeError(f"{name} must be a Keras model, got {network!r}")
     if not network.built or not hasattr(network, "input_shape"):
         raise ValueError(f"{name} must be a Sequential or functional model with an Input layer")
 
 
-def check_fits(q_network: keras.Model, num_features: int, num_actions: int) -> None:
+def check_fits(q_network: keras.Model, state_shape: tuple[int, ...], num_actions: int) -> None:
     """ValueError if the network does not take this environment's states or give its actions' values, all finite."""
     check_network("q_network", q_network)
-    shapes = (q_network.input_shape[1:], q_network.output_shape[1:])
-    if shapes != ((num_features,), (num_actions,)):
+    takes, gives = q_network.input_shape, q_network.output_shape
+    fits = isinstance(takes, tuple) and tf.TensorShape(takes).is_compatible_with((None, *state_shape))
+    if not fits or gives != (None, num_actions):
         raise ValueError(
-            f"q_network must map {num_features} features to {num_actions} actions, "
-            f"got input {shapes[0]} and output {shapes[1]}"
+            f"q_network must map states of shape {state_shape} to {num_actions} actions, "
+            f"got input {_without_batch(takes)} and output {_without_batch(gives)}"
         )
+    if (dtype := q_network.outputs[0].dtype) != "float32":
+        raise ValueError(f"q_network must give float32 values, got {dtype}")
     if not all(np.isfinite(w).all() for w in q_network.get_weights()):
         raise ValueError("q_network must have finite weights, got NaN or infinity among them")
+
+
+def is_all_finite(*tensors: tf.Tensor) -> tf.Tensor:
+    """A boolean scalar. Whole numbers are."""
+    floats = [x for x in map(tf.convert_to_tensor, tensors) if x.dtype.is_floating]
+    return tf.reduce_all([tf.reduce_all(tf.math.is_finite(x)) for x in floats])
+
+
+def _without_batch(shape: Any) -> Any:
+    return shape[1:] if isinstance(shape, tuple) else shape

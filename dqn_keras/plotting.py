@@ -1,13 +1,14 @@
-"""Learning curves: of one run, and of many."""
+"""Learning curves: of one run, with what was measured on the way, and of many."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from dqn_keras.config import count
+from dqn_keras.config import Config, count
 from dqn_keras.study import Study
+from dqn_keras.training import Run
 
 
 def plot_rewards(rewards: Sequence[float] | np.ndarray, ax: Axes | None = None, window: int = 20) -> Axes:
@@ -34,6 +35,42 @@ def plot_rewards(rewards: Sequence[float] | np.ndarray, ax: Axes | None = None, 
     ax.legend(loc="upper left")
     ax.grid(alpha=0.3)
     return ax
+
+
+def plot_run(run: Run) -> np.ndarray:
+    """A run at a glance: its rewards, and under them Q-values, TD error, terminal transitions and speed.
+
+    Q-values above their bound are the surest sign that learning goes wrong; what else to look for is in the
+    documentation, "It does not learn". The five Axes are returned in that order.
+    """
+    return plot_history(run.history, run.config)
+
+
+def plot_history(history: Mapping[str, Sequence[float]], config: Config) -> np.ndarray:
+    """The same from `run.history` alone, or from the columns of a log file."""
+    columns = {name: np.asarray(values, np.float64) for name, values in history.items()}
+    figure = plt.figure(figsize=(10, 9), layout="constrained")
+    grid = figure.add_gridspec(3, 2, height_ratios=(1.5, 1, 1))
+    rewards = plot_rewards(columns["reward"], figure.add_subplot(grid[0, :]))
+    rewards.axhline(config.solved_reward, color="black", linestyle=":", linewidth=1, label="Solved")
+    rewards.legend(loc="upper left")
+    panels = [figure.add_subplot(grid[i, j], sharex=rewards) for i in (1, 2) for j in (0, 1)]
+    values, errors, terminals, speed = panels
+
+    values.plot(columns["mean_q"], color="tab:blue", label="Mean")
+    values.plot(columns["max_q"], color="tab:orange", label="Highest")
+    values.plot(columns["q_bound"], color="black", linestyle="--", linewidth=1, label="Bound")
+    values.set(title="Q-values of the batches", ylabel="max over a of Q(s, a)")
+    values.legend(loc="best")
+    errors.plot(columns["td_error"], color="tab:blue")
+    errors.set(title="TD error", ylabel="Mean of |y - Q(s, a)|", ylim=(0, None))
+    terminals.plot(100 * columns["terminal_share"], color="tab:blue")
+    terminals.set(title="Terminal transitions in the memory", xlabel="Episode", ylabel="Share (%)", ylim=(0, None))
+    speed.plot(columns["steps_per_second"], color="tab:blue")
+    speed.set(title="Speed, learning included", xlabel="Episode", ylabel="Env steps per second", ylim=(0, None))
+    for ax in panels:
+        ax.grid(alpha=0.3)
+    return np.array([rewards, *panels])
 
 
 def plot_study(

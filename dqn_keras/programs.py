@@ -10,10 +10,8 @@ from collections.abc import Callable, Hashable, Sequence
 from numbers import Real
 from typing import Any, NamedTuple
 
-import keras
-import tensorflow as tf
-
-from dqn_keras._tensorflow import require_xla
+from dqn_keras._tensorflow import keras, require_xla, tf
+from dqn_keras.networks import clone, structure
 
 
 class Learner(NamedTuple):
@@ -28,13 +26,24 @@ class Learner(NamedTuple):
         """All that they hold, in an order that their configuration fixes."""
         return [*self.q_network.variables, *self.q_hat_network.variables, *self.optimizer.variables]
 
+    def prepare(self) -> None:
+        """Check that the networks belong together, and build the optimizer."""
+        q_network, q_hat_network, optimizer = self
+        if not isinstance(optimizer, keras.Optimizer):
+            raise TypeError(f"optimizer must be a Keras optimizer, got {optimizer!r}")
+        if q_network is q_hat_network:
+            raise ValueError("q_hat_network must be a second network, got q_network itself")
+        shapes, hat_shapes = ([tuple(w.shape) for w in n.weights] for n in (q_network, q_hat_network))
+        if shapes != hat_shapes:
+            raise ValueError(f"q_hat_network must have weights of q_network's shapes {shapes}, got {hat_shapes}")
+        if not optimizer.built:
+            optimizer.build(q_network.trainable_variables)
+        optimizer._check_variables_are_known(q_network.trainable_variables)  # else ValueError, in Keras' words
+
     def template(self, jit_compile: bool) -> "Learner":
         """New ones of the same configuration, with variables of their own."""
         clone_layer = _clone_for_xla if jit_compile else None
-        q_network, q_hat_network = (
-            keras.models.clone_model(network, clone_function=clone_layer)
-            for network in (self.q_network, self.q_hat_network)
-        )
+        q_network, q_hat_network = (clone(network, clone_layer) for network in self[:2])
         optimizer = type(self.optimizer).from_config(self.optimizer.get_config())
         optimizer.build(q_network.trainable_variables)
         return Learner(q_network, q_hat_network, optimizer)
@@ -44,21 +53,15 @@ class Learner(NamedTuple):
         optimizer_config = self.optimizer.get_config()
         if isinstance(optimizer_config.get("learning_rate"), Real):
             del optimizer_config["learning_rate"]  # a variable
-        parts = (
-            _structure(self.q_network.get_config()),
-            _structure(self.q_hat_network.get_config()),
-            _structure(optimizer_config),
-        )
+        del optimizer_config["name"]
         variables = [(tuple(v.shape), v.dtype, v.trainable) for v in self.variables]
-        return type(self.optimizer), json.dumps(parts, sort_keys=True, default=repr), tuple(variables)
-
-
-def _structure(config: Any) -> Any:
-    """A Keras configuration without names, and without initializers: they have done their work."""
-    if isinstance(config, dict):
-        kept = {k: v for k, v in config.items() if k != "name" and not k.endswith("_initializer")}
-        return {k: v if k == "dtype" else _structure(v) for k, v in kept.items()}
-    return [_structure(x) for x in config] if isinstance(config, list | tuple) else config
+        networks = structure(self.q_network), structure(self.q_hat_network)
+        return (
+            *networks,
+            type(self.optimizer),
+            json.dumps(optimizer_config, sort_keys=True, default=repr),
+            tuple(variables),
+        )
 
 
 def _clone_for_xla(layer: keras.layers.Layer) -> keras.layers.Layer:

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 import gymnasium as gym
-import keras
 import numpy as np
 from PIL import Image
 
+from dqn_keras._tensorflow import keras
 from dqn_keras.agent import checked_seed, evaluation_seed
 from dqn_keras.config import count
 from dqn_keras.environment import CheckedEnv
@@ -28,7 +28,7 @@ def record_episode(
     `render_mode="rgb_array"`, which needs no display; ValueError otherwise.
     """
     checked_env = CheckedEnv(env)
-    check_fits(q_network, checked_env.spaces.num_features, checked_env.spaces.num_actions)
+    check_fits(q_network, checked_env.spaces.state_shape, checked_env.spaces.num_actions)
     if env.render_mode != "rgb_array":
         raise ValueError(f'env must be made with render_mode="rgb_array", got {env.render_mode!r}')
     q_values = q_function(q_network)

@@ -4,13 +4,14 @@ Successive transitions are strongly correlated, and a gradient step wants indepe
 draw from at random gives those, and lets one transition be learned from more than once (Mnih et al. 2015).
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import tensorflow as tf
 
-from dqn_keras.config import count, number
+from dqn_keras._tensorflow import tf
+from dqn_keras.config import count, counts, number
 
 
 class Experience(NamedTuple):
@@ -20,32 +21,34 @@ class Experience(NamedTuple):
     A time limit (`truncated`) also ends an episode, but the state it ends in has a future, and is not marked.
     """
 
-    state: Any  # [F] float32
+    state: Any  # [*S] float32, or uint8 as images are
     action: Any  # int32, an index: 0 <= action < A
     reward: Any  # float32
-    next_state: Any  # [F] float32
+    next_state: Any  # [*S], as state
     terminal_state: Any  # float32, 1 or 0
-
-
-def unpack(rows: Any, num_features: int) -> Experience:
-    """Rows of a ReplayMemory, [B, 2F + 3] float32, as a batch; for NumPy arrays and tensors alike."""
-    f = num_features
-    actions = rows[:, 2 * f]
-    actions = tf.cast(actions, tf.int32) if tf.is_tensor(actions) else actions.astype(np.int32)
-    return Experience(rows[:, :f], actions, rows[:, 2 * f + 1], rows[:, f : 2 * f], rows[:, 2 * f + 2])
 
 
 class ReplayMemory:
     """The last `memory_size` transitions, in a ring that is allocated once.
 
-    One transition is one row (state, next_state, action, reward, terminal_state), so that it is written, drawn
+    One transition is one row (state, next_state, and as float32 action, reward, terminal_state), so that it is drawn
     and handed to TensorFlow as one array. float32 holds an action's index exactly up to 2^24.
+
+    Args:
+        memory_size: transitions.
+        state_shape: of one state, such as (4,), or (84, 84, 4) for images.
+        dtype: of the states: float32, or uint8, which takes a quarter of the room.
     """
 
-    def __init__(self, memory_size: int, num_features: int) -> None:
-        memory_size, num_features = count("memory_size", memory_size), count("num_features", num_features)
-        self.num_features = num_features
-        self.rows = np.zeros((memory_size, 2 * num_features + 3), np.float32)
+    def __init__(self, memory_size: int, state_shape: tuple[int, ...], dtype: Any = np.float32) -> None:
+        memory_size, self.state_shape = count("memory_size", memory_size), counts("state_shape", state_shape)
+        if dtype not in (np.float32, np.uint8):
+            raise ValueError(f"dtype must be float32 or uint8, got {dtype!r}")
+        size = math.prod(self.state_shape)
+        self.rows = np.zeros((memory_size, 2 * size + 12 // np.dtype(dtype).itemsize), dtype)
+        self._states = self.rows[:, :size].reshape(memory_size, *self.state_shape)
+        self._next_states = self.rows[:, size : 2 * size].reshape(memory_size, *self.state_shape)
+        self._scalars = self.rows[:, 2 * size :].view(np.float32)  # [memory_size, 3]
         self.num_appended = 0
         """Transitions ever appended; the next one goes to row `num_appended % memory_size`."""
 
@@ -57,13 +60,13 @@ class ReplayMemory:
 
         It stands in the innermost loop and checks nothing; `train` checks what comes out of the environment.
         """
-        f = self.num_features
-        row = self.rows[self.num_appended % len(self.rows)]
-        row[:f], row[2 * f], row[2 * f + 1], row[f : 2 * f], row[2 * f + 2] = experience
+        i = self.num_appended % len(self.rows)
+        scalars = self._scalars[i]
+        self._states[i], scalars[0], scalars[1], self._next_states[i], scalars[2] = experience
         self.num_appended += 1
 
     def sample_rows(self, batch_size: int, rng: np.random.Generator) -> np.ndarray:
-        """A uniformly random batch without repeats, [B, 2F + 3] float32; drawn by one `rng.choice`.
+        """A uniformly random batch without repeats, as rows; drawn by one `rng.choice`.
 
         Index 0 is the oldest transition that is left, as in a deque. ValueError if the memory holds fewer.
         """
@@ -74,7 +77,32 @@ class ReplayMemory:
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Experience:
         """A uniformly random batch without repeats, as arrays with a leading axis B."""
-        return unpack(self.sample_rows(batch_size, rng), self.num_features)
+        return unpack(self.sample_rows(batch_size, rng), self.state_shape)
+
+
+def unpack(rows: Any, state_shape: tuple[int, ...]) -> Experience:
+    """Rows of a ReplayMemory as a batch of B; for NumPy arrays and tensors alike."""
+    size, shape = math.prod(state_shape), (-1, *state_shape)
+    states, next_states, scalars = rows[:, :size], rows[:, size : 2 * size], rows[:, 2 * size :]
+    if tf.is_tensor(rows):
+        if rows.dtype != tf.float32:
+            scalars = tf.bitcast(tf.reshape(scalars, [-1, 3, 4]), tf.float32)
+        states, next_states = tf.reshape(states, shape), tf.reshape(next_states, shape)
+        actions = tf.cast(scalars[:, 0], tf.int32)
+    else:
+        scalars = np.ascontiguousarray(scalars).view(np.float32)
+        states, next_states = states.reshape(shape), next_states.reshape(shape)
+        actions = scalars[:, 0].astype(np.int32)
+    return Experience(states, actions, scalars[:, 1], next_states, scalars[:, 2])
+
+
+def pack(experience: Experience) -> tf.Tensor:
+    """One transition, of tensors, as a row of a ReplayMemory."""
+    state, action, reward, next_state, terminal_state = experience
+    scalars = tf.stack([tf.cast(x, tf.float32) for x in (action, reward, terminal_state)])
+    if state.dtype != tf.float32:
+        scalars = tf.bitcast(scalars, state.dtype)  # [3, 4]
+    return tf.concat([tf.reshape(x, [-1]) for x in (state, next_state, scalars)], axis=0)
 
 
 def as_batch(experiences: Sequence[Any], state_shape: tuple[int, ...], num_actions: int) -> Experience:

@@ -18,11 +18,10 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 import scipy  # whose parts are imported when they are used
-import tensorflow as tf
 from gymnasium.experimental.functional import FuncEnv
 from joblib import Parallel, cpu_count, delayed, parallel_config
-from tqdm import TqdmWarning
 
+from dqn_keras._tensorflow import tf
 from dqn_keras.agent import recycle
 from dqn_keras.checkpoint import (
     FORMAT,
@@ -34,10 +33,8 @@ from dqn_keras.checkpoint import (
     warn_of_other_versions,
 )
 from dqn_keras.config import Config, count
+from dqn_keras.progress import tqdm
 from dqn_keras.training import check_arguments, train
-
-with warnings.catch_warnings(action="ignore", category=TqdmWarning):  # without ipywidgets a notebook's bar is text
-    from tqdm.auto import tqdm
 
 
 class Outcome(NamedTuple):

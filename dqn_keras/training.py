@@ -2,21 +2,27 @@
 
 import contextlib
 import dataclasses
+import math
 import os
+import time
 import warnings
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 
 import gymnasium as gym
-import keras
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras import compiled_loop, gymnasium_loop
-from dqn_keras.agent import Agent, Episode, checked_seed, make_agent
+from dqn_keras._tensorflow import keras
+from dqn_keras.agent import Agent, DivergedError, Episode, checked_seed, make_agent
 from dqn_keras.checkpoint import Checkpoints, save_agent
 from dqn_keras.config import Config, count
-from dqn_keras.environment import CheckedEnv
+from dqn_keras.diagnostics import Log, history
+from dqn_keras.environment import CheckedEnv, Spaces
 from dqn_keras.interruption import stop_requests
+from dqn_keras.learn import loss_values
+from dqn_keras.networks import check_fits
+from dqn_keras.progress import tqdm
 
 
 @dataclasses.dataclass(repr=False)
@@ -28,6 +34,10 @@ class Run:
     """Networks, optimizer, memory and random state, as the last episode left them."""
     interrupted: bool = False
     """Whether Ctrl-C or SIGTERM came: it has then ended at the end of that episode."""
+    diverged: bool = False
+    """Whether learning diverged, and a callback (keras.callbacks.TerminateOnNaN) ended the run without an error."""
+    steps_per_second: Sequence[float] = ()
+    """Environment steps, learning included, of each episode; NaN for those that were played before a resume."""
 
     @property
     def solved_at(self) -> int | None:
@@ -43,6 +53,11 @@ class Run:
     def rewards(self) -> np.ndarray:
         """[num_episodes] float64, each episode's undiscounted sum."""
         return np.array([episode.reward for episode in self.episodes], np.float64)
+
+    @property
+    def history(self) -> dict[str, list[float]]:
+        """What callbacks were told, a list for each name, as `history` of what Keras' `model.fit` returns."""
+        return {**history(self.episodes, self.config), "steps_per_second": list(self.steps_per_second)}
 
     @property
     def seed(self) -> int:
@@ -73,87 +88,121 @@ def train(
     config: Config = Config(),
     seed: int | None = None,
     *,
+    q_network: keras.Model | None = None,
+    loss: Callable = loss_values,
     verbose: int = 1,
     callbacks: Sequence[keras.callbacks.Callback] = (),
     checkpoint: str | os.PathLike | None = None,
     checkpoint_every: int = 100,
     resume: bool = False,
 ) -> Run:
-    """Train a Deep Q-Network from scratch until it solves `env` or `config.num_episodes` are over.
+    """Train a Deep Q-Network until it solves `env` or `config.num_episodes` are over.
 
     Args:
-        env: a gymnasium.Env with a Box observation space of one axis and a Discrete action space; or a
-            functional one (gymnasium.experimental.functional.FuncEnv) written in TensorFlow, whose episodes are
-            compiled whole, such as `dqn_keras.environments.CartPole()`.
+        env: a gymnasium.Env with a Box observation space and a Discrete action space; or a functional one
+            (gymnasium.experimental.functional.FuncEnv) written in TensorFlow, whose episodes are compiled whole, such
+            as `dqn_keras.environments.CartPole()`.
         config: the parameters; by default the original notebook's.
         seed: a whole number. One seed, one result, bit for bit, on one machine; None draws one (see `run.seed`).
-        verbose: 1 prints a line every 100 episodes and one when solved, 0 nothing.
-        callbacks: Keras callbacks; an episode is an epoch, and its logs are number, reward, steps, epsilon, loss.
+        q_network: a network of your own, states [B, *S] -> Q-values [B, A]: a built Sequential or functional model,
+            trained in place from the weights it has, by Adam with `config.alpha`; Q-hat starts as its equal copy. By
+            default that of `make_q_network`, for observations of one axis. Where observations are uint8, as images are,
+            they stay that in the memory, and the network scales them (keras.layers.Rescaling(1 / 255)).
+        loss: a function in the place of `loss_values`: (experiences, gamma, q_network, q_hat_network) -> scalar
+            tensor, `experiences` being an Experience of tensors with a leading axis B.
+        verbose: 1 prints a line every 100 episodes and one when solved, 2 shows a progress bar beside them, 0 nothing.
+        callbacks: Keras callbacks; an episode is an epoch of one batch, and its logs are what `run.history` holds.
+            They see the network as the episode left it, may change it, and may set `model.stop_training`. So compiled
+            episodes are then played one at a time, unless all callbacks are plain keras.callbacks.CSVLogger.
         checkpoint: a folder for this run's checkpoints, each its whole state; None saves none. If the disk refuses
             one on the way, that is a warning, and the run goes on. What is put into the environment after it was made,
             or kept under other names than the constructor's, is not noticed to differ.
         checkpoint_every: episodes between two of them, or a few more where episodes are compiled; the start and the
             end of the run are saved too.
         resume: go on from the newest checkpoint in the folder that is whole, or start if there is none yet. The
-            result is that of a run that was never interrupted, bit for bit; `config` and `env` must be the same, but
-            for a num_episodes that may be larger. What callbacks remember is theirs to save.
+            result is that of a run that was never interrupted, bit for bit; `config`, `env`, `loss` and the layers of
+            `q_network` must be the same, but for a num_episodes that may be larger. What callbacks remember is theirs
+            to save.
 
     Ctrl-C, an interrupted notebook cell and SIGTERM end the run at the end of an episode, saved if there is a
     checkpoint, and `train` returns what there is, marked `interrupted`; a second one raises KeyboardInterrupt.
 
     Raises:
-        TypeError, ValueError: an argument or a space is not supported; the environment returned a NaN,
-            an infinity or another shape than promised (the message names episode and step); learning diverged.
+        TypeError, ValueError: an argument or a space is not supported; the network does not fit the environment; the
+            environment returned a NaN, an infinity or another shape than promised (the message names episode and
+            step); learning diverged.
     """
     check_arguments(env, config, verbose)
+    if not callable(loss):
+        raise TypeError(f"loss must be a function, got {loss!r}")
     if resume and checkpoint is None:
         raise ValueError("resume needs a folder to resume from: checkpoint, got None")
     checkpoint_every = count("checkpoint_every", checkpoint_every)
-    agent_seed = checked_seed(seed)
     if isinstance(env, FuncEnv):
-        spaces = compiled_loop.check_functional(env)
-        agent = make_agent(spaces.num_features, spaces.num_actions, config, agent_seed)
-        # A callback may change the agent between episodes, and sees it as it then is.
-        episodes_per_call = 1 if callbacks else min(100, checkpoint_every)
-        episodes = compiled_loop.episodes(env, spaces, agent, config, episodes_per_call)
+        name, spaces = type(env).__name__, compiled_loop.check_functional(env)
     else:
         checked_env = CheckedEnv(env)
-        agent = make_agent(checked_env.spaces.num_features, checked_env.spaces.num_actions, config, agent_seed)
-        episodes = gymnasium_loop.episodes(checked_env, agent, config)
+        name, spaces = checked_env.name, checked_env.spaces
+    _check_network(name, spaces, q_network)
+    agent = make_agent(
+        spaces.state_shape, spaces.num_actions, config, checked_seed(seed), q_network, spaces.state_dtype
+    )
     checkpoints = None
     if checkpoint is not None:
-        checkpoints = Checkpoints(checkpoint, env, config)
+        checkpoints = Checkpoints(checkpoint, env, config, q_network, loss)
         _start_or_resume(checkpoints, agent, seed, resume, verbose)
 
+    if isinstance(env, FuncEnv):
+        # A callback may change the agent between episodes, and sees it as it then is.
+        only_logs = all(type(callback) is keras.callbacks.CSVLogger for callback in callbacks)
+        episodes_per_call = min(100, checkpoint_every) if only_logs else 1
+        episodes = compiled_loop.episodes(env, spaces, agent, config, episodes_per_call, loss)
+    else:
+        episodes = gymnasium_loop.episodes(checked_env, agent, config, loss)
     saved_at = len(agent.episodes)
-    is_over = _is_solved(agent.episodes, config)  # a resumed run may be
+    speeds = [math.nan] * saved_at
+    played = _timed(episodes, agent, speeds)
     if callbacks:
-        episodes = _with_callbacks(episodes, agent, config, callbacks)
-    with stop_requests() as is_asked_to_stop:
-        with contextlib.closing(episodes) as played:
-            while not is_over and (episode := next(played, None)):
+        played = _with_callbacks(played, agent, config, callbacks, speeds)
+
+    is_over, diverged = _is_solved(agent.episodes, config), False  # a resumed run may be solved
+    bar = tqdm(total=config.num_episodes, initial=saved_at, unit="episode", disable=verbose < 2)
+    say = bar.write if verbose == 2 else print
+    with stop_requests() as is_asked_to_stop, bar:
+        with contextlib.closing(played):
+            while not is_over:
+                try:
+                    episode = next(played, None)
+                except DivergedError:
+                    if not agent.q_network.stop_training:
+                        raise
+                    diverged = True
+                    break
+                if episode is None:
+                    break
+                bar.update()
                 if verbose and episode.number % 100 == 0:
                     last = [e.reward for e in agent.episodes[max(0, episode.number - 99) : episode.number + 1]]
                     average = round(float(np.mean(last)), 2)
-                    print(f"Episode {episode.number}, Reward: {episode.reward}, Last 100 Average: {average}")
+                    say(f"Episode {episode.number}, Reward: {episode.reward}, Last 100 Average: {average}")
                 if len(agent.episodes) > episode.number + 1:
                     continue  # compiled episodes: the agent is already further
                 if checkpoints and len(agent.episodes) >= saved_at + checkpoint_every:
                     _save_or_warn(checkpoints, agent)
                     saved_at = len(agent.episodes)
                 is_over = _is_solved(agent.episodes, config) or is_asked_to_stop()
-        if checkpoints and (callbacks or len(agent.episodes) > saved_at):
+        if checkpoints and not diverged and (callbacks or len(agent.episodes) > saved_at):
             _save_or_warn(checkpoints, agent)  # after on_train_end, in which a callback may change the agent
         interrupted = is_asked_to_stop()
 
-    run = Run(config, agent, interrupted)
+    run = Run(config, agent, interrupted, diverged, speeds)
     if verbose and run.solved_at is not None:
         average = round(float(np.mean(run.rewards[-config.solved_window :])), 2)
         print(f"Solved with {average} reward in {run.solved_at} episodes!")
     elif verbose and interrupted:
         how = "; resume=True goes on from the last checkpoint" if checkpoints else ""
         print(f"Interrupted: the run has {len(agent.episodes)} episodes{how}")
-    if not agent.num_updates and not interrupted:
+    if not (agent.num_updates or interrupted or diverged):
         warnings.warn(
             f"train ended without an update: the memory holds {len(agent.memory)} transitions, "
             f"batch_size is {config.batch_size}",
@@ -168,10 +217,21 @@ def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> Non
         raise TypeError(f"env must be a gymnasium.Env or a FuncEnv, got {env!r}")
     if not isinstance(config, Config):
         raise TypeError(f"config must be a Config, got {config!r}")
-    if verbose not in (0, 1):
-        raise ValueError(f"verbose must be 0 or 1, got {verbose!r}")
+    if verbose not in (0, 1, 2):
+        raise ValueError(f"verbose must be 0, 1 or 2, got {verbose!r}")
     if isinstance(env, FuncEnv) and not config.jit_compile:
         raise ValueError("jit_compile must be True for a functional environment, got False: its loop needs XLA")
+
+
+def _check_network(name: str, spaces: Spaces, q_network: keras.Model | None) -> None:
+    """ValueError if the network, or by default that of `make_q_network`, does not fit the environment."""
+    if q_network is not None:
+        check_fits(q_network, spaces.state_shape, spaces.num_actions)
+    elif len(spaces.state_shape) != 1:
+        raise ValueError(
+            f"env {name} has observations of shape {spaces.state_shape}, the default network takes one axis: "
+            "q_network must be a network of your own, got None (or wrap env in gymnasium.wrappers.FlattenObservation)"
+        )
 
 
 def _is_solved(episodes: Sequence[Episode], config: Config) -> bool:
@@ -206,20 +266,53 @@ def _save_or_warn(checkpoints: Checkpoints, agent: Agent) -> None:
         )
 
 
+def _timed(episodes: Iterator[Episode], agent: Agent, steps_per_second: list[float]) -> Generator[Episode, None, None]:
+    """The same episodes; the speed of each is appended. Those that are played in one call have that of the call."""
+    while True:
+        start = time.perf_counter()
+        episode = next(episodes, None)
+        if episode is None:
+            return
+        if len(steps_per_second) <= episode.number:
+            new = agent.episodes[episode.number :]
+            speed = sum(e.steps for e in new) / (time.perf_counter() - start)
+            steps_per_second += [speed] * len(new)
+        yield episode
+
+
 def _with_callbacks(
-    episodes: Iterator[Episode], agent: Agent, config: Config, callbacks: Sequence[keras.callbacks.Callback]
+    episodes: Iterator[Episode],
+    agent: Agent,
+    config: Config,
+    callbacks: Sequence[keras.callbacks.Callback],
+    steps_per_second: list[float],
 ) -> Generator[Episode, None, None]:
-    """The same episodes, each told to the callbacks as an epoch, until one of them asks to stop."""
-    agent.q_network.stop_training = False
-    listeners = keras.callbacks.CallbackList(callbacks, model=agent.q_network, epochs=config.num_episodes)
+    """The same episodes, each told to the callbacks as an epoch of one batch, until one of them asks to stop."""
+    network, log = agent.q_network, Log(config)
+    network.stop_training = False
+    listeners = keras.callbacks.CallbackList(callbacks, model=network, epochs=config.num_episodes, steps=1, verbose=0)
+
+    def tell(event: str, number: int, logs: dict[str, float]) -> None:
+        for callback in listeners.callbacks:  # the list's own methods take 50 us: they look for tensors in the logs
+            getattr(callback, event)(number, logs)
+
+    for episode in agent.episodes:
+        log.add(episode)
     listeners.on_train_begin()
     try:
         for number in range(len(agent.episodes), config.num_episodes):
-            listeners.on_epoch_begin(number)
-            episode = next(episodes)
-            listeners.on_epoch_end(episode.number, episode._asdict())
+            tell("on_epoch_begin", number, {})
+            tell("on_train_batch_begin", 0, {})
+            try:
+                episode = next(episodes)
+            except DivergedError:
+                tell("on_train_batch_end", 0, {"loss": math.nan})
+                raise
+            logs = {**log.add(episode), "steps_per_second": steps_per_second[number]}
+            tell("on_train_batch_end", 0, {} if math.isnan(episode.loss) else {"loss": episode.loss})
+            tell("on_epoch_end", number, logs)
             yield episode
-            if agent.q_network.stop_training:
+            if network.stop_training:
                 break
     finally:
         listeners.on_train_end()

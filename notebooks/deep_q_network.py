@@ -38,6 +38,7 @@ from dqn_keras import (
     make_q_network,
     plot_rewards,
     record_episode,
+    td_errors,
     train,
     update_q_hat,
 )
@@ -137,7 +138,7 @@ source(Experience)
 # $y - Q(s, a)$ is the *temporal-difference error*: how much better or worse it went than $Q$ had thought.
 
 # %%
-source(loss_values)
+source(td_errors, loss_values)
 
 # %% [markdown]
 # Two transitions that differ only in their end. Where the episode went on, the target is $1 + 0.95 \max_{a'} \hat Q$;
@@ -209,7 +210,7 @@ source(action, decay_epsilon)
 source(ReplayMemory.sample_rows)
 
 # %%
-memory = ReplayMemory(config.memory_size, num_features=4)
+memory = ReplayMemory(config.memory_size, state_shape=(4,))
 state, _ = env.reset(seed=seed)
 for _ in range(10):
     a = action(q_network(state[None]), config.epsilon, rng)
@@ -221,8 +222,8 @@ memory.sample(3, rng)
 # %% [markdown]
 # ## Training
 #
-# All the parts in their order, for one episode. (Acting needs $Q$ of a single state; the loop computes it in NumPy with
-# the weights that `update`, the compiled learning step, has just given back.)
+# All the parts in their order, for one episode. (Acting needs $Q$ of a single state; `q` computes it in NumPy, with the
+# weights that its last update, a compiled learning step, has given back.)
 
 # %%
 source(gymnasium_loop._play_episode)

@@ -159,7 +159,7 @@ def spoilt(content, rng):
     elif way == "tail":
         spoilt += rng.randbytes(rng.randrange(1, 100))
     elif way == "swapped members":
-        names = rng.choice([(b"q_network/hidden_1/bias", b"q_hat_network/hidden_1/bias"), (b"momentum", b"velocity")])
+        names = rng.choice([(b"q_network/1", b"q_hat_network/1"), (b"optimizer/2", b"optimizer/4")])
         spoilt = spoilt.replace(names[0], b"\0").replace(names[1], names[0]).replace(b"\0", names[1])
     else:
         start = rng.randrange(len(content) - 32)
@@ -202,7 +202,7 @@ def corruption_campaign(folder, number, seed=0):
     good, older = newest(source).read_bytes(), min(source.glob("checkpoint-*.npz"))
     expected = from_bytes(older.read_bytes())[0]
     tried, silent = {}, []
-    agent = make_agent(4, 2, config, SEED)
+    agent = make_agent((4,), 2, config, SEED)
     for _ in range(number):
         way, content = (spoilt if rng.random() < 0.8 else forged)(good, rng)
         if content == good:
@@ -232,7 +232,7 @@ def forgetting_campaign(loop, folder):
     half = Config(**{**vars(CONFIG), "num_episodes": 120})
     play(loop, folder / "half", config=half)
     arrays, facts = from_bytes(newest(folder / "half").read_bytes())
-    fresh = make_agent(4, 2, run.config, SEED)
+    fresh = make_agent((4,), 2, run.config, SEED)
     start_arrays, start_facts = checkpoint._arrays(fresh), checkpoint._facts(fresh)
     start_facts["rng"] = np.random.default_rng(0).bit_generator.state
     start_facts["seed"] = 0

@@ -108,7 +108,10 @@ OTHERS = {
         lambda: play(observation_space=gym.spaces.Dict({"a": Discrete(2)})),
         "env Corridor has the observation space",
     ),
-    "images": (lambda: play(observation_space=Box(0, 255, (8, 8, 3), np.uint8)), "env Corridor has the observation"),
+    "images": (
+        lambda: play(observation_space=Box(0, 255, (8, 8, 3), np.uint8)),
+        r"env Corridor has observations of shape \(8, 8, 3\), the default network takes one axis: q_network must be",
+    ),
     "reset of the old API": (lambda: train(OldReset(), verbose=0), r"env OldReset: reset\(\) must return"),
     "step of the old API": (lambda: train(OldStep(), verbose=0), r"env OldStep: step\(\) must return"),
     "a vector environment": (lambda: train(gym.make_vec("CartPole-v1", 2), verbose=0), "env must be a gymnasium.Env"),
@@ -125,8 +128,8 @@ OTHERS = {
     "weights of NaN": (lambda: evaluate(Corridor(), network(weight=NAN)), "q_network must have finite weights"),
     "a network for another environment": (lambda: evaluate(Corridor(), network(num_features=3)), "q_network must map"),
     "Q-values of two states": (lambda: action(np.zeros((2, 2)), 0.1, np.random.default_rng(0)), "q_values must be"),
-    "a memory of no transitions": (lambda: ReplayMemory(0, 4), "memory_size must be"),
-    "no hidden layer": (lambda: counts("hidden_units", []), "hidden_units must name"),
+    "a memory of no transitions": (lambda: ReplayMemory(0, (4,)), "memory_size must be"),
+    "no hidden layer": (lambda: counts("hidden_units", []), "hidden_units must hold"),
     "a file that is no network": (lambda: load_agent(__file__), "path .* is not a network"),
 }
 

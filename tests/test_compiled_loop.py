@@ -48,7 +48,7 @@ def run(request):
 
 def transitions(run):
     """The memory, oldest first, cut into episodes."""
-    batch = unpack(run.agent.memory.rows[: len(run.agent.memory)], run.agent.memory.num_features)
+    batch = unpack(run.agent.memory.rows[: len(run.agent.memory)], run.agent.memory.state_shape)
     ends = np.cumsum([episode.steps for episode in run.episodes])
     assert ends[-1] == len(run.agent.memory)
     return [type(batch)(*(field[i:j] for field in batch)) for i, j in zip([0, *ends], ends, strict=False)]
@@ -73,7 +73,7 @@ def test_whole_episodes_replayed_in_gymnasium_agree(run, cartpole):
 
 
 def test_its_draws_actions_and_updates_replayed_step_by_step_through_learn_agree(run):
-    config, agent = run.config, make_agent(4, 2, run.config, 0)
+    config, agent = run.config, make_agent((4,), 2, run.config, 0)
     rows, num_steps, epsilon, updates = run.agent.memory.rows, 0, config.epsilon, 0
     n, batch_size = config.steps_per_update, config.batch_size
     close_calls = 0
@@ -92,7 +92,7 @@ def test_its_draws_actions_and_updates_replayed_step_by_step_through_learn_agree
             num_steps += 1
             if t % n == 0 and num_steps >= batch_size:
                 indices = sample_indices(bits[2 * n :], key, turn, num_steps).numpy()
-                learn(unpack(rows[indices], 4), config.gamma, *agent.learner, tau=config.tau)
+                learn(unpack(rows[indices], (4,)), config.gamma, *agent.learner, tau=config.tau)
                 updates += 1
         epsilon = decay_epsilon(epsilon, config)
     assert updates == run.agent.num_updates > 400
@@ -141,8 +141,8 @@ def test_xla_draws_what_tensorflow_draws():
 def test_one_seed_gives_the_same_bits_however_many_episodes_a_call_plays():
     prints = []
     for episodes_per_call in (1, 7, 100):
-        agent = make_agent(4, 2, QUICK, 3)
-        played = list(episodes(CartPole(), Spaces(4, 2, 0), agent, QUICK, episodes_per_call))
+        agent = make_agent((4,), 2, QUICK, 3)
+        played = list(episodes(CartPole(), Spaces((4,), np.dtype(np.float32), 2, 0), agent, QUICK, episodes_per_call))
         assert [e.number for e in played] == list(range(30))
         prints.append([w.tobytes() for w in agent.q_network.get_weights()] + [[e.reward for e in played]])
     assert prints[0] == prints[1] == prints[2]
@@ -308,8 +308,8 @@ def test_without_xla_the_error_says_what_works(monkeypatch, cartpole):
 
 def test_resident_memory_stays_flat_over_a_million_steps():
     config = Config(num_episodes=100_000, solved_reward=1e9, epsilon=0.1)
-    agent = make_agent(4, 2, config, 0)
-    loop = episodes(CartPole(), Spaces(4, 2, 0), agent, config)
+    agent = make_agent((4,), 2, config, 0)
+    loop = episodes(CartPole(), Spaces((4,), np.dtype(np.float32), 2, 0), agent, config)
 
     def play(num_steps):
         end = agent.memory.num_appended + num_steps

@@ -50,7 +50,7 @@ def test_evaluation_changes_no_weight(cartpole):
 
 
 def test_bad_arguments_are_named(cartpole):
-    with pytest.raises(ValueError, match=r"^q_network must map 4 features to 2 actions, got input \(2,\)"):
+    with pytest.raises(ValueError, match=r"^q_network must map states of shape \(4,\) to 2 actions, got input \(2,\)"):
         evaluate(cartpole, always(0))
     with pytest.raises(ValueError, match=r"^num_episodes"):
         evaluate(cartpole, make_q_network(4, 2), num_episodes=0)

@@ -26,7 +26,7 @@ class Recorded(gym.Wrapper):
 def play(env, config, seed, num_steps):
     """Whole episodes of the loop until at least `num_steps` are played."""
     checked = CheckedEnv(env)
-    agent = make_agent(checked.spaces.num_features, checked.spaces.num_actions, config, seed)
+    agent = make_agent(checked.spaces.state_shape, checked.spaces.num_actions, config, seed)
     played = []
     for episode in episodes(checked, agent, config):
         played.append(episode)
@@ -60,7 +60,7 @@ def test_the_loop_is_the_originals_algorithm_step_for_step(cartpole, seed, param
     agent, played = play(env, config, seed, 2_000)
     actions = env.actions
 
-    twin = make_agent(4, 2, config, seed)
+    twin = make_agent((4,), 2, config, seed)
     env.actions = []
     original = original_algorithm.run(
         env, twin.q_network, twin.q_hat_network, twin.rng, lambda k: episode_seed(seed, k), **parameters
@@ -162,7 +162,7 @@ def test_large_but_finite_numbers_pass():
 
 def test_weights_that_become_nan_stop_the_run_in_the_same_update(cartpole):
     checked, config = CheckedEnv(cartpole), Config()
-    agent = make_agent(4, 2, config, 0)
+    agent = make_agent((4,), 2, config, 0)
     loop = episodes(checked, agent, config)
     for _ in range(10):
         next(loop)
@@ -173,7 +173,7 @@ def test_weights_that_become_nan_stop_the_run_in_the_same_update(cartpole):
 
 def test_resident_memory_stays_flat_over_150_000_steps(cartpole):
     config = Config(num_episodes=100_000, epsilon=0.1)
-    agent = make_agent(4, 2, config, 0)
+    agent = make_agent((4,), 2, config, 0)
     loop = episodes(CheckedEnv(cartpole), agent, config)
 
     def after(num_steps):

@@ -55,5 +55,5 @@ def test_q_function_takes_any_network(rng):
 
 
 def test_a_network_that_does_not_fit_is_told():
-    with pytest.raises(ValueError, match=r"4 features to 2 actions, got input \(4,\) and output \(3,\)"):
-        check_fits(make_q_network(4, 3), 4, 2)
+    with pytest.raises(ValueError, match=r"states of shape \(4,\) to 2 actions, got input \(4,\) and output \(3,\)"):
+        check_fits(make_q_network(4, 3), (4,), 2)

@@ -2,7 +2,6 @@ import os
 import subprocess
 import sys
 
-import keras
 import pytest
 
 import dqn_keras
@@ -18,10 +17,27 @@ def test_learn_is_one_function_under_both_spellings():
     assert (loss_values, update_q_hat) == (dqn_keras.loss_values, dqn_keras.update_q_hat)
 
 
-def test_importing_prints_nothing():
+@pytest.mark.parametrize("statement", ["from dqn_keras import train", "from dqn_keras.environments import CartPole"])
+def test_importing_prints_nothing(statement):
     environment = {k: v for k, v in os.environ.items() if k != "TF_CPP_MIN_LOG_LEVEL"}
-    done = subprocess.run([sys.executable, "-c", "import dqn_keras"], env=environment, capture_output=True, check=True)
+    done = subprocess.run([sys.executable, "-c", statement], env=environment, capture_output=True, check=True)
     assert (done.stdout, done.stderr) == (b"", b"")
+
+
+@pytest.mark.parametrize(
+    "first",
+    ["import dqn_keras.learn", "import dqn_keras.study", "from dqn_keras import train", "import dqn_keras.training"],
+)
+def test_a_name_is_the_function_whichever_module_came_first(first):
+    script = f"{first}\nfrom dqn_keras import learn, study\nassert callable(learn) and callable(study)"
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_tensorflow_is_imported_when_a_name_needs_it():
+    script = (
+        "import sys, dqn_keras; dqn_keras.Config(); assert not {'keras', 'tensorflow', 'gymnasium'} & {*sys.modules}"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 def test_all_is_public_and_there():
@@ -30,7 +46,11 @@ def test_all_is_public_and_there():
         assert getattr(dqn_keras, name) is not None
 
 
-def test_another_keras_backend_is_refused(monkeypatch):
-    monkeypatch.setattr(keras.backend, "backend", lambda: "jax")
+def test_another_keras_backend_is_refused():
     with pytest.raises(ImportError, match=r"^dqn_keras needs Keras on TensorFlow, not on 'jax'"):
-        require_tensorflow_backend()
+        require_tensorflow_backend("jax")
+    environment = {**os.environ, "KERAS_BACKEND": "jax"}
+    done = subprocess.run(
+        [sys.executable, "-c", "from dqn_keras import learn"], env=environment, capture_output=True, text=True
+    )
+    assert "ImportError: dqn_keras needs Keras on TensorFlow, not on 'jax'" in done.stderr

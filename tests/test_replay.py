@@ -16,7 +16,7 @@ class MemoryAgainstDeque(RuleBasedStateMachine):
 
     @initialize(size=st.integers(1, 12), features=st.integers(1, 3), seed=st.integers(0, 99))
     def start(self, size, features, seed):
-        self.memory, self.model = ReplayMemory(size, features), deque(maxlen=size)
+        self.memory, self.model = ReplayMemory(size, (features,)), deque(maxlen=size)
         self.features, self.numbers = features, np.random.default_rng(seed)
 
     @rule()
@@ -47,7 +47,7 @@ TestMemoryAgainstDeque = MemoryAgainstDeque.TestCase
 
 
 def filled(size, count):
-    memory = ReplayMemory(size, 1)
+    memory = ReplayMemory(size, (1,))
     for i in range(count):
         memory.append(Experience([i], i % 2, i, [i + 1], 0))
     return memory
@@ -71,6 +71,6 @@ def test_a_batch_has_the_dtypes_that_learn_wants(rng):
 
 def test_rows_unpack_alike_in_numpy_and_tensorflow():
     rows = filled(8, 8).rows
-    for array, tensor in zip(unpack(rows, 1), unpack(tf.constant(rows), 1), strict=True):
+    for array, tensor in zip(unpack(rows, (1,)), unpack(tf.constant(rows), (1,)), strict=True):
         np.testing.assert_array_equal(array, tensor.numpy())
         assert array.dtype == tensor.numpy().dtype

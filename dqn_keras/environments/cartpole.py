@@ -4,9 +4,10 @@ import math
 from typing import Any
 
 import numpy as np
-import tensorflow as tf
 from gymnasium import spaces
 from gymnasium.experimental.functional import FuncEnv
+
+from dqn_keras._tensorflow import tf
 
 GRAVITY = 9.8  # m/s^2
 MASS_CART, MASS_POLE = 1.0, 0.1  # kg

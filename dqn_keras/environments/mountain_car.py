@@ -3,9 +3,10 @@
 from typing import Any
 
 import numpy as np
-import tensorflow as tf
 from gymnasium import spaces
 from gymnasium.experimental.functional import FuncEnv
+
+from dqn_keras._tensorflow import tf
 
 MIN_POSITION, MAX_POSITION, GOAL = -1.2, 0.6, 0.5
 MAX_SPEED = 0.07

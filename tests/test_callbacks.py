@@ -1,0 +1,167 @@
+"""Keras' own callbacks in both loops: an episode is an epoch."""
+
+import csv
+
+import gymnasium as gym
+import keras
+import numpy as np
+import pytest
+import tensorflow as tf
+
+from dqn_keras import Config, evaluate, train
+from dqn_keras.environments import CartPole
+from tests.test_compiled_loop import SpoiledVelocity
+
+CONFIG = Config(num_episodes=40, batch_size=16, memory_size=300, solved_reward=1e6)
+NAMES = ["reward", "average_reward", "steps", "epsilon", "loss", "mean_q", "max_q", "q_bound", "td_error"]
+NAMES += ["terminal_share", "steps_per_second"]
+
+
+@pytest.fixture(params=["Gymnasium loop", "compiled episodes"])
+def env(request):
+    return CartPole() if request.param == "compiled episodes" else gym.make("CartPole-v1")
+
+
+def play(env, *callbacks, config=CONFIG, **arguments):
+    return train(env, config, seed=2, callbacks=callbacks, **{"verbose": 0, **arguments})
+
+
+def weights(run):
+    return np.concatenate([w.ravel() for w in run.q_network.get_weights()])
+
+
+def test_the_history_is_what_keras_history_heard(env):
+    heard = keras.callbacks.History()
+    run = play(env, heard)
+    assert list(run.history) == NAMES
+    assert heard.epoch == list(range(40))
+    for name in NAMES:
+        np.testing.assert_array_equal(run.history[name], heard.history[name])
+
+
+def test_csv_logger_writes_the_history_and_changes_nothing(env, tmp_path):
+    run = play(env, keras.callbacks.CSVLogger(tmp_path / "log.csv"))
+    rows = list(csv.DictReader((tmp_path / "log.csv").open()))
+    assert [int(row["epoch"]) for row in rows] == list(range(40))
+    for name in NAMES:
+        np.testing.assert_array_equal([float(row[name]) for row in rows], run.history[name])
+    np.testing.assert_array_equal(weights(run), weights(play(env)))  # none at all
+    np.testing.assert_array_equal(weights(run), weights(play(env, keras.callbacks.Callback())))  # one call an episode
+
+
+def test_tensorboard_shows_every_scalar(env, tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run = play(env, keras.callbacks.TensorBoard(tmp_path))
+    events = EventAccumulator(str(tmp_path / "train"), size_guidance={"tensors": 0})  # all of them
+    events.Reload()
+    for name in NAMES:
+        scalars = events.Tensors(f"epoch_{name}")
+        assert [event.step for event in scalars] == list(range(40))
+        shown = [float(tf.make_ndarray(event.tensor_proto)) for event in scalars]
+        np.testing.assert_allclose(shown, run.history[name], rtol=1e-6)
+
+
+class Snapshots(keras.callbacks.Callback):
+    def __init__(self):
+        super().__init__()
+        self.weights = []
+
+    def on_epoch_end(self, epoch, logs=None):
+        self.weights.append(self.model.get_weights())
+
+
+def test_model_checkpoint_keeps_the_network_of_the_best_moving_average(env, tmp_path):
+    snapshots, path = Snapshots(), tmp_path / "best.keras"
+    saver = keras.callbacks.ModelCheckpoint(path, monitor="average_reward", mode="max", save_best_only=True)
+    run = play(env, snapshots, saver)
+    best = snapshots.weights[int(np.argmax(run.history["average_reward"]))]
+    kept = keras.saving.load_model(path)
+    for ours, theirs in zip(kept.get_weights(), best, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert evaluate(gym.make("CartPole-v1"), kept, 1, seed=0).shape == (1,)
+
+
+def test_early_stopping_ends_the_run_where_it_should_and_gives_back_the_best_weights(env):
+    rewards = play(env).rewards
+    patience, best, waited = 5, -np.inf, 0
+    for stop, reward in enumerate(rewards):  # noqa: B007
+        best, waited = (reward, 0) if reward > best else (best, waited + 1)
+        if waited == patience:
+            break
+    assert stop < 39
+    snapshots = Snapshots()
+    stopper = keras.callbacks.EarlyStopping("reward", mode="max", patience=patience, restore_best_weights=True)
+    run = play(env, snapshots, stopper)
+    np.testing.assert_array_equal(run.rewards, rewards[: stop + 1])
+    best_weights = snapshots.weights[int(np.argmax(run.rewards))]
+    for ours, theirs in zip(run.q_network.get_weights(), best_weights, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_terminate_on_nan_ends_a_run_that_diverges(env, tmp_path):
+    terminate = keras.callbacks.TerminateOnNaN()
+    run = play(env, SpoiledVelocity(), terminate, checkpoint=tmp_path / "run", checkpoint_every=5)
+    assert (run.diverged, len(run.rewards)) == (True, 12)
+    sound = play(env, checkpoint=tmp_path / "run", resume=True)  # from episode 10: what was kept is whole
+    np.testing.assert_array_equal(weights(sound), weights(play(env)))
+    assert not sound.diverged
+    with pytest.raises(ValueError, match="not finite in episode 12"):
+        play(env, SpoiledVelocity())
+
+
+def test_terminate_on_nan_does_not_mind_the_episodes_before_the_first_update(env):
+    run = play(env, keras.callbacks.TerminateOnNaN(), config=Config(num_episodes=30, batch_size=200))
+    assert np.isnan(run.history["loss"][0])
+    assert len(run.rewards) == 30
+
+
+def test_lambda_callbacks_hear_everything_in_keras_order(env):
+    tape = []
+    events = ("train_begin", "epoch_begin", "train_batch_begin", "train_batch_end", "epoch_end", "train_end")
+    listeners = {
+        f"on_{event}": lambda *arguments, event=event: tape.append((event, *arguments[:-1])) for event in events
+    }
+    play(env, keras.callbacks.LambdaCallback(**listeners), config=Config(num_episodes=2, batch_size=2))
+    episode = [[("epoch_begin", k), ("train_batch_begin", 0), ("train_batch_end", 0), ("epoch_end", k)] for k in (0, 1)]
+    assert tape == [("train_begin",), *episode[0], *episode[1], ("train_end",)]
+
+
+class Meddler(keras.callbacks.Callback):
+    """A reader's own callback: at one episode it takes all that was learned away."""
+
+    def on_epoch_begin(self, epoch, logs=None):
+        if epoch == 20:
+            self.model.set_weights([np.zeros_like(w) for w in self.model.get_weights()])
+
+
+def test_a_callback_may_change_the_network(env):
+    run, other = play(env), play(env, Meddler())
+    assert run.history["mean_q"][:20] == pytest.approx(other.history["mean_q"][:20], nan_ok=True)
+    assert other.history["mean_q"][20] < 0.5 < run.history["mean_q"][20]
+
+
+def test_the_bar_stands_beside_the_originals_lines(env, capfd):
+    config = Config(num_episodes=110, batch_size=16, solved_reward=1e6)
+    play(env, config=config, verbose=1)
+    lines = capfd.readouterr().out
+    play(env, config=config, verbose=2)
+    out, bar = capfd.readouterr()
+    assert out.split() == lines.split()  # tqdm writes them between its own
+    assert "110/110" in bar
+    play(env, keras.callbacks.Callback(), config=config, verbose=0)
+    captured = capfd.readouterr()
+    assert captured.out == "" and "episode" not in captured.err  # noqa: PT018
+
+
+def test_the_numbers_of_a_resumed_run_are_those_of_the_whole_run(env, tmp_path):
+    whole = play(env)
+    play(env, config=Config(**{**vars(CONFIG), "num_episodes": 15}), checkpoint=tmp_path)
+    heard = keras.callbacks.History()
+    run = play(env, heard, checkpoint=tmp_path, resume=True)
+    assert heard.epoch == list(range(15, 40))
+    for name in NAMES[:-1]:
+        np.testing.assert_array_equal(run.history[name], whole.history[name])
+        np.testing.assert_array_equal(heard.history[name], whole.history[name][15:])
+    assert np.isnan(run.history["steps_per_second"][:15]).all()
+    assert (np.array(run.history["steps_per_second"][15:]) > 0).all()

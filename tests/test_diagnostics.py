@@ -1,0 +1,83 @@
+import math
+
+import gymnasium as gym
+import keras
+import numpy as np
+import pytest
+
+from dqn_keras import Config, make_networks, train
+from dqn_keras.agent import Episode
+from dqn_keras.diagnostics import Log, Measures, measured_step, sum_up
+from dqn_keras.environments import Acrobot, CartPole
+from dqn_keras.learn import loss_values
+from dqn_keras.networks import q_values
+from dqn_keras.programs import Learner
+from dqn_keras.replay import as_batch
+from tests.environments import Corridor
+
+
+def test_the_measures_are_those_of_the_batch_before_the_step(random_batch):
+    batch = random_batch(32)
+    networks = make_networks(4, 2, seed=0)
+    networks[1].set_weights([w + 0.1 for w in networks[1].get_weights()])
+    q, q_hat = (network.get_weights() for network in networks)
+    states, actions, rewards, next_states, terminal = batch
+    targets = rewards + (1 - terminal) * 0.95 * q_values(q_hat, next_states).max(axis=1)
+    errors = targets - q_values(q, states)[np.arange(32), actions]
+    best = q_values(q, states).max(axis=1)
+
+    learner = Learner(*networks, keras.optimizers.Adam())
+    learner.prepare()
+    measures = measured_step(as_batch(batch, (4,), 2), learner, Config(), loss_values)
+    expected = Measures(np.mean(errors**2), best.mean(), best.max(), np.abs(errors).mean())
+    np.testing.assert_allclose(measures, expected, rtol=1e-4)
+
+
+def test_an_episode_is_the_mean_of_its_updates_and_their_highest_q():
+    assert sum_up([Measures(1.0, 2.0, 3.0, 4.0), Measures(2.0, 4.0, 9.0, 0.0)]) == Measures(1.5, 3.0, 9.0, 2.0)
+    assert all(math.isnan(x) for x in sum_up([]))
+
+
+@pytest.mark.parametrize("make_env", [lambda: gym.make("CartPole-v1"), CartPole], ids=["Gymnasium", "compiled"])
+def test_the_terminal_share_is_that_of_the_memory(make_env):
+    # With as many transitions as whole episodes: the memory's oldest may be of the middle of one, ended later or not.
+    for memory_size in (100_000, 400):
+        run = train(make_env(), Config(num_episodes=60, memory_size=memory_size, batch_size=16), seed=0, verbose=0)
+        memory = run.agent.memory
+        terminal = memory.rows[: len(memory), -1].mean()
+        assert run.history["terminal_share"][-1] == terminal
+    assert sum(run.history["steps"]) > 400
+
+
+def episode(reward=1.0, steps=10, terminated=True, max_reward=1.0):
+    return Episode(0, reward, steps, 1.0, math.nan, math.nan, math.nan, math.nan, max_reward, terminated)
+
+
+def test_the_moving_average_is_over_the_window_of_the_stop_rule():
+    log = Log(Config(solved_window=3))
+    assert [log.add(episode(reward))["average_reward"] for reward in (1, 2, 6, 7, 8)] == [1, 1.5, 3, 5, 7]
+
+
+@pytest.mark.parametrize(
+    ("rewards", "gamma", "bounds"),
+    [
+        ([1.0, 2.0, 1.0], 0.5, [2, 4, 4]),  # forever
+        ([-1.0, -1.0], 0.5, [-1, -1]),  # once, and then the end
+        ([-1.0, 0.0], 0.9, [-1, 0]),
+        ([1.0], 1.0, [math.inf]),
+        ([0.0, -1.0], 1.0, [0, 0]),
+    ],
+)
+def test_the_bound_is_the_highest_return_that_there_can_be(rewards, gamma, bounds):
+    log = Log(Config(gamma=gamma))
+    assert [log.add(episode(max_reward=r))["q_bound"] for r in rewards] == pytest.approx(bounds)
+
+
+def test_both_loops_note_the_highest_reward_and_the_end():
+    run = train(Corridor(length=9, limit=6, reward=lambda t: [0, 5, 1][t % 3]), Config(num_episodes=30), 0, verbose=0)
+    assert {e.max_reward for e in run.episodes} == {5.0}
+    assert not any(e.terminated for e in run.episodes)
+    for env in (gym.make("Acrobot-v1"), Acrobot()):
+        run = train(env, Config(num_episodes=3, epsilon_min=1.0), seed=0, verbose=0)
+        assert [e.max_reward for e in run.episodes] == [0.0 if e.terminated else -1.0 for e in run.episodes]
+        assert [e.terminated for e in run.episodes] == [e.reward > -e.steps for e in run.episodes]
