@@ -82,8 +82,16 @@ def block(found: re.Match) -> str:
 
 
 def mathml(latex: str, display: str) -> str:
-    """LaTeX as MathML, with two things put right that browsers would show badly."""
+    """LaTeX as MathML, put right where browsers would show it badly."""
     markup = convert(html.unescape(latex).strip(), display=display)
-    markup = markup.replace("<mo>&#x0005E;</mo>", "<mo>&#x002C6;</mo>")  # the accent, not the character of programs
-    # A parenthesis with an exponent takes its size only in a row.
-    return re.sub(r"<msup>(<mo stretchy[^>]*>[^<]*</mo>)", r"<msup><mrow>\1</mrow>", markup)
+    for pattern, better in REPAIRS:
+        markup = re.sub(pattern, better, markup)
+    return markup
+
+
+REPAIRS = [
+    ("<mo>&#x0005E;</mo>", "<mo>&#x002C6;</mo>"),  # a hat: the accent, not the character of programs
+    ("<mi>&#x0003B;</mi>", "<mo>&#x0003B;</mo>"),  # a semicolon has a space after it
+    (r"<msup>(<mi>\w</mi>)<mi>(&#x02032;)</mi></msup>", r"<mrow>\1<mo>\2</mo></mrow>"),  # a prime is raised as it is
+    (r"<msup>(<mo stretchy[^>]*>[^<]*</mo>)", r"<msup><mrow>\1</mrow>"),  # a parenthesis takes its size only in a row
+]

@@ -79,6 +79,12 @@ def test_every_cross_reference_names_what_is_in_the_reference():
             assert any(name == path or name.startswith(f"{path}.") for path in paths), name
 
 
+def test_the_design_names_every_module():
+    design = (DOCS / "design" / "index.md").read_text()
+    for module in (ROOT / "dqn_keras").glob("[!_]*.py"):
+        assert f"`{module.name}`" in design or module.name in {"progress.py", "version.py"}, module.name
+
+
 def test_every_result_and_notebook_is_in_the_navigation():
     navigation = (ROOT / "mkdocs.yml").read_text()
     for page in MADE:
