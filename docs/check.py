@@ -1,0 +1,157 @@
+"""Open every page of the built site in headless Chromium, and say what is wrong with it.
+
+`make docs` runs it after the build. A page is wrong if it logs an error, asks another host for anything, has a picture
+that does not show or has no alt text, a link within the site that leads nowhere, or a formula left as LaTeX. The moving
+picture has to move, and the search to find.
+"""
+
+import functools
+import os
+import shutil
+import sys
+import threading
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import unquote, urldefrag, urlsplit
+
+from playwright.sync_api import Browser, Page, sync_playwright
+
+SITE = Path(__file__).parent.parent / "site"
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+
+LOOK = r"""async () => {
+    const images = [...document.images];
+    await Promise.all(images.map(image => image.decode().catch(() => {})));
+    const inText = node => !node.parentElement.closest("pre, code, script, style, math");
+    const texts = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+    while (walker.nextNode()) if (inText(walker.currentNode)) texts.push(walker.currentNode.data);
+    return {
+        images: images.map(image => ({src: image.src, width: image.naturalWidth, alt: image.getAttribute("alt")})),
+        links: [...document.querySelectorAll("a[href]")].map(link => link.href),
+        ids: [...document.querySelectorAll("[id], a[name]")].map(element => element.id || element.name),
+        formulas: document.querySelectorAll("math").length,
+        latex: texts.filter(text => /\$[^$\n]+\$|\\[(\[]|\\(frac|hat|max|sum|gamma|tau)/.test(text)),
+    };
+}"""
+
+
+class Handler(SimpleHTTPRequestHandler):
+    """The site, without a line for each request."""
+
+    def log_message(self, *_: object) -> None:
+        """Nothing."""
+
+
+def check(browser: Browser, host: str) -> int:
+    """Look at every page; the number of things that are wrong."""
+    names = sorted(str(path.relative_to(SITE)) for path in SITE.rglob("*.html"))
+    wrong: dict[str, list[str]] = {name: [] for name in names}
+    seen, moving = {}, 0
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    for name in names:
+        seen[name] = look(page, host, name, wrong[name])
+        for image in seen[name]["images"]:
+            file = SITE / unquote(urlsplit(image["src"]).path).lstrip("/")
+            if file.is_file() and b"acTL" in file.read_bytes()[:200]:  # the mark of an animated PNG
+                moving += 1
+                if not moves(page, image["src"]):
+                    wrong[name].append(f"does not move: {image['src']}")
+    for name in names:
+        for link in seen[name]["links"]:
+            if problem := broken(link, host, seen):
+                wrong[name].append(f"{problem}: {link}")
+    if not moving:
+        wrong["index.html"].append("no page has a moving picture")
+    if not finds(page, host, "ReplayMemory"):
+        wrong["index.html"].append("the search does not find ReplayMemory")
+
+    for name in names:
+        counts = {key: len(seen[name][key]) for key in ("images", "links")} | {"formulas": seen[name]["formulas"]}
+        print("FAIL" if wrong[name] else "ok  ", name, ", ".join(f"{count} {key}" for key, count in counts.items()))
+        for problem in dict.fromkeys(wrong[name]):
+            print("    ", problem)
+    num_wrong = sum(map(len, wrong.values()))
+    print(f"{len(names)} pages, {moving} moving pictures, {num_wrong} problems")
+    return num_wrong
+
+
+def look(page: Page, host: str, name: str, problems: list[str]) -> dict:
+    """Open one page; what is on it. `problems` is added to."""
+    listeners = {
+        "console": lambda message: message.type == "error" and problems.append(f"console: {message.text}"),
+        "pageerror": lambda error: problems.append(f"error: {error}"),
+        "requestfailed": lambda request: problems.append(f"request failed: {request.url}"),
+        "request": lambda request: foreign(request.url, host) and problems.append(f"another host: {request.url}"),
+        "response": lambda response: response.status >= 400 and problems.append(f"{response.status}: {response.url}"),
+    }
+    for event, listener in listeners.items():
+        page.on(event, listener)
+    page.goto(f"{host}/{name}", wait_until="networkidle")
+    found = page.evaluate(LOOK)
+    for event, listener in listeners.items():
+        page.remove_listener(event, listener)
+    for image in found["images"]:
+        if not image["width"]:
+            problems.append(f"picture does not show: {image['src']}")
+        if not image["alt"] and "assets/logo" not in image["src"]:
+            problems.append(f"picture without alt text: {image['src']}")
+    problems.extend(f"LaTeX left in the text: {text.strip()[:80]}" for text in found["latex"])
+    return found
+
+
+def foreign(url: str, host: str) -> bool:
+    """Whether it is neither of the site nor held in the page itself."""
+    return not url.startswith((f"{host}/", "data:", "blob:"))
+
+
+def broken(link: str, host: str, seen: dict[str, dict]) -> str:
+    """What is wrong with a link within the site; nothing for any other."""
+    if not link.startswith(f"{host}/"):
+        return ""
+    target, fragment = urldefrag(link)
+    name = unquote(urlsplit(target).path).lstrip("/") or "index.html"
+    if not (SITE / name).is_file():
+        return "link to nothing"
+    if fragment and name in seen and unquote(fragment) not in seen[name]["ids"]:
+        return "link to no such place"
+    return ""
+
+
+def moves(page: Page, src: str) -> bool:
+    """Whether a picture looks different a moment later."""
+    image = page.locator(f'img[src$="{src.rsplit("/", 1)[1]}"]').first
+    first = image.screenshot()
+    for _ in range(10):
+        page.wait_for_timeout(200)
+        if image.screenshot() != first:
+            return True
+    return False
+
+
+def finds(page: Page, host: str, word: str) -> bool:
+    """Whether the search, which runs in the browser, has results for a word."""
+    page.goto(f"{host}/index.html")
+    page.locator("input.md-search__input").fill(word)
+    results = page.locator("a.md-search-result__link")
+    results.first.wait_for(state="attached", timeout=10_000)
+    return results.count() > 0
+
+
+def main() -> int:
+    """The exit status: 0 if all is well, or if there is no browser and none is required."""
+    chromium = next(filter(None, map(shutil.which, NAMES)), None)
+    if chromium is None:
+        print("The pages are built, but not looked at: there is no Chromium (apt-get install chromium).")
+        return int(os.environ.get("REQUIRE_BROWSER") == "1")
+    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=SITE))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium)
+        num_wrong = check(browser, f"http://127.0.0.1:{server.server_port}")
+        browser.close()
+    server.shutdown()
+    return int(num_wrong > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

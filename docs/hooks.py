@@ -1,0 +1,97 @@
+"""What the site has beyond its plugins: the repository's notebooks and results as pages, and formulas as MathML."""
+
+import base64
+import html
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import nbformat
+from latex2mathml.converter import convert
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parent.parent
+ALT_TEXTS = {  # of the pictures in the notebooks, by the tag of their cell
+    "save-rewards": "Episode rewards of one run: about 20 for 170 episodes, then a climb to over 225",
+    "save-pole": "The moving picture of one greedy episode: the network keeps the pole upright",
+    "save-hundred_seeds": "A hundred seeds: learning curves, episodes to solved, share solved by episode",
+    "save-one_collapse": "One seed that got stuck: reward, greedy return, highest Q, share of terminal transitions",
+}
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add what is kept elsewhere in the repository, from where it is."""
+    for path in sorted(ROOT.glob("results/*.*")):
+        files.append(File.generated(config, f"results/{path.name}", abs_src_path=str(path)))
+    for path in sorted(ROOT.glob("notebooks/*.ipynb")):
+        files.append(File.generated(config, f"notebooks/{path.name}", abs_src_path=str(path)))
+        pictures: dict[str, bytes] = {}
+        page = "\n\n".join(notebook_blocks(path, pictures))
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=page))
+        for name, content in pictures.items():
+            files.append(File.generated(config, f"notebooks/{name}", content=content))
+    return files
+
+
+def notebook_blocks(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
+    """A notebook with its committed outputs as Markdown; nothing is executed. `pictures` is filled by file name."""
+    heading = ""
+    for cell in nbformat.read(path, as_version=4).cells:
+        if cell.cell_type == "markdown":
+            yield cell.source
+            for line in re.findall(r"^#+ (.*)", cell.source, re.MULTILINE):
+                if not heading:
+                    yield f"*A notebook, with its outputs: [{path.name}]({path.name}).*{{ .source }}"
+                heading = line
+            continue
+        yield fence(cell.source, "python")
+        for output in cell.outputs:
+            data = output.get("data", {})
+            if "image/png" in data:
+                name = f"{path.stem}_{len(pictures) + 1}.png"
+                pictures[name] = base64.b64decode(data["image/png"])
+                tags = [tag for tag in cell.metadata.get("tags", []) if tag in ALT_TEXTS]
+                yield f"![{ALT_TEXTS[tags[0]] if tags else 'Picture: ' + heading}]({name})"
+            elif "text/markdown" in data:
+                yield data["text/markdown"]
+            else:
+                yield fence(output.get("text") or data["text/plain"], "text", "output")
+
+
+def fence(content: str, *classes: str) -> str:
+    """A code block; with four ticks, since the code may hold three."""
+    return f"````{{{' '.join('.' + name for name in classes)}}}\n{content.rstrip()}\n````"
+
+
+def on_page_content(content: str, **_: Any) -> str:
+    r"""Formulas, which arithmatex has marked as \(...\) or \[...\], as MathML, which a browser shows by itself."""
+    content = re.sub(r'<span class="arithmatex">\\\((.*?)\\\)</span>', inline, content, flags=re.DOTALL)
+    return re.sub(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', block, content, flags=re.DOTALL)
+
+
+def inline(found: re.Match) -> str:
+    """A formula in a line."""
+    return mathml(found[1], "inline")
+
+
+def block(found: re.Match) -> str:
+    """A formula of its own; it scrolls where the page is narrow."""
+    return f'<div class="formula" tabindex="0">{mathml(found[1], "block")}</div>'
+
+
+def mathml(latex: str, display: str) -> str:
+    """LaTeX as MathML, put right where browsers would show it badly."""
+    markup = convert(html.unescape(latex).strip(), display=display)
+    for pattern, better in REPAIRS:
+        markup = re.sub(pattern, better, markup)
+    return markup
+
+
+REPAIRS = [
+    ("<mo>&#x0005E;</mo>", "<mo>&#x002C6;</mo>"),  # a hat: the accent, not the character of programs
+    ("<mi>&#x0003B;</mi>", "<mo>&#x0003B;</mo>"),  # a semicolon has a space after it
+    (r"<msup>(<mi>\w</mi>)<mi>(&#x02032;)</mi></msup>", r"<mrow>\1<mo>\2</mo></mrow>"),  # a prime is raised as it is
+    (r"<msup>(<mo stretchy[^>]*>[^<]*</mo>)", r"<msup><mrow>\1</mrow>"),  # a parenthesis takes its size only in a row
+]
