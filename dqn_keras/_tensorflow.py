@@ -41,6 +41,8 @@ require_tensorflow_backend(os.environ.get("KERAS_BACKEND", "tensorflow"))
 with _native_stderr_silenced():
     import keras
     import tensorflow as tf
+
+    tf.config.list_physical_devices()  # it looks for GPUs once, and complains where there is none
 require_tensorflow_backend(keras.backend.backend())
 
 __all__ = ["keras", "require_xla", "tf"]

@@ -138,12 +138,7 @@ def train(
     if resume and checkpoint is None:
         raise ValueError("resume needs a folder to resume from: checkpoint, got None")
     checkpoint_every = count("checkpoint_every", checkpoint_every)
-    if isinstance(env, FuncEnv):
-        name, spaces = type(env).__name__, compiled_loop.check_functional(env)
-    else:
-        checked_env = CheckedEnv(env)
-        name, spaces = checked_env.name, checked_env.spaces
-    _check_network(name, spaces, q_network)
+    spaces = check_environment(env, q_network)
     agent = make_agent(
         spaces.state_shape, spaces.num_actions, config, checked_seed(seed), q_network, spaces.state_dtype
     )
@@ -158,7 +153,7 @@ def train(
         episodes_per_call = min(100, checkpoint_every) if only_logs else 1
         episodes = compiled_loop.episodes(env, spaces, agent, config, episodes_per_call, loss)
     else:
-        episodes = gymnasium_loop.episodes(checked_env, agent, config, loss)
+        episodes = gymnasium_loop.episodes(CheckedEnv(env), agent, config, loss)
     saved_at = len(agent.episodes)
     speeds = [math.nan] * saved_at
     played = _timed(episodes, agent, speeds)
@@ -200,8 +195,8 @@ def train(
         average = round(float(np.mean(run.rewards[-config.solved_window :])), 2)
         print(f"Solved with {average} reward in {run.solved_at} episodes!")
     elif verbose and interrupted:
-        how = "; resume=True goes on from the last checkpoint" if checkpoints else ""
-        print(f"Interrupted: the run has {len(agent.episodes)} episodes{how}")
+        kept = f", kept in {checkpoints.folder}" if checkpoints else ""
+        print(f"Interrupted after {len(agent.episodes)} episodes{kept}")
     if not (agent.num_updates or interrupted or diverged):
         warnings.warn(
             f"train ended without an update: the memory holds {len(agent.memory)} transitions, "
@@ -223,8 +218,13 @@ def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> Non
         raise ValueError("jit_compile must be True for a functional environment, got False: its loop needs XLA")
 
 
-def _check_network(name: str, spaces: Spaces, q_network: keras.Model | None) -> None:
-    """ValueError if the network, or by default that of `make_q_network`, does not fit the environment."""
+def check_environment(env: gym.Env | FuncEnv, q_network: keras.Model | None = None) -> Spaces:
+    """The sizes of its spaces; ValueError if they are not supported, or not by the network (None: the default one)."""
+    if isinstance(env, FuncEnv):
+        name, spaces = type(env).__name__, compiled_loop.check_functional(env)
+    else:
+        door = CheckedEnv(env)
+        name, spaces = door.name, door.spaces
     if q_network is not None:
         check_fits(q_network, spaces.state_shape, spaces.num_actions)
     elif len(spaces.state_shape) != 1:
@@ -232,6 +232,7 @@ def _check_network(name: str, spaces: Spaces, q_network: keras.Model | None) -> 
             f"env {name} has observations of shape {spaces.state_shape}, the default network takes one axis: "
             "q_network must be a network of your own, got None (or wrap env in gymnasium.wrappers.FlattenObservation)"
         )
+    return spaces
 
 
 def _is_solved(episodes: Sequence[Episode], config: Config) -> bool:

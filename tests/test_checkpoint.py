@@ -306,7 +306,7 @@ def test_a_request_stops_the_run_at_the_end_of_that_episode(loop, number, capsys
     run = train(LOOPS[loop](), QUICK, SEED, callbacks=[Asking(number)])
     assert run.interrupted
     assert len(run.episodes) == 8
-    assert capsys.readouterr().out.splitlines()[-1] == "Interrupted: the run has 8 episodes"
+    assert capsys.readouterr().out.splitlines()[-1] == "Interrupted after 8 episodes"
     assert [signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 

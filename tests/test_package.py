@@ -20,7 +20,12 @@ def test_learn_is_one_function_under_both_spellings():
 @pytest.mark.parametrize("statement", ["from dqn_keras import train", "from dqn_keras.environments import CartPole"])
 def test_importing_prints_nothing(statement):
     environment = {k: v for k, v in os.environ.items() if k != "TF_CPP_MIN_LOG_LEVEL"}
-    done = subprocess.run([sys.executable, "-c", statement], env=environment, capture_output=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", f"{statement}\nimport tensorflow as tf; tf.constant(1) + 1"],
+        env=environment,
+        capture_output=True,
+        check=True,
+    )
     assert (done.stdout, done.stderr) == (b"", b"")
 
 

@@ -4,4 +4,7 @@ from dqn_keras.environments.acrobot import Acrobot
 from dqn_keras.environments.cartpole import CartPole
 from dqn_keras.environments.mountain_car import MountainCar
 
-__all__ = ["Acrobot", "CartPole", "MountainCar"]
+TWINS = {"CartPole-v1": CartPole, "Acrobot-v1": Acrobot, "MountainCar-v0": MountainCar}
+"""By the id of the environment in Gymnasium whose dynamics they are."""
+
+__all__ = ["TWINS", "Acrobot", "CartPole", "MountainCar"]

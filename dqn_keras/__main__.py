@@ -1,0 +1,7 @@
+"""`python -m dqn_keras` is the command `dqn-keras`."""
+
+import sys
+
+from dqn_keras.cli import main
+
+sys.exit(main())

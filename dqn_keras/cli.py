@@ -1,0 +1,182 @@
+"""The command line: its options, and what becomes of errors. What the commands do is in `commands`.
+
+TensorFlow and Gymnasium are not imported before a command is run, so that `--help` is there at once.
+"""
+
+import contextlib
+import dataclasses
+import io
+import os
+import re
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
+
+from dqn_keras.config import Config
+from dqn_keras.version import __version__
+
+Flag = FlagCreatePairsOff[bool]
+Folder = Annotated[Positional[Path], arg(metavar="FOLDER")]
+
+
+@dataclasses.dataclass(kw_only=True)
+class _Task:
+    """An environment, and how to learn it."""
+
+    env: Annotated[Positional[str], arg(metavar="ENV")]
+    """Id of a Gymnasium environment, such as CartPole-v1; MODULE:ID imports the module that registers it."""
+    config: OmitArgPrefixes[Config] = Config()
+    """The parameters of the algorithm; the defaults are the original notebook's."""
+    env_args: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE ...", help_behavior_hint="(default: none)")] = ()
+    """Arguments of gymnasium.make, such as is_slippery=False map_name=8x8."""
+    flatten: Flag = False
+    """Flatten the observations to one axis (FlattenObservation), as Discrete ones need it."""
+    compiled: Flag = False
+    """Compile whole episodes: seconds of compilation, and then about ten times as fast. For CartPole-v1, Acrobot-v1 and
+    MountainCar-v0, which have a functional twin."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Train(_Task):
+    """Train an agent, and keep it in a folder."""
+
+    seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: drawn)")] = None
+    """One seed, one run, bit for bit."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: runs/ENV-SEED)")] = None
+    """Where to keep the run: config.json (environment, seed, parameters, versions), log.csv (a line for each episode),
+    agent.keras (the network), curve.png, and checkpoint/, from which `resume` goes on. Ctrl-C ends the run at the end
+    of an episode, and all of it is kept."""
+    tensorboard: Flag = False
+    """Also write every scalar for TensorBoard, into the folder's tensorboard/ (slower)."""
+    quiet: Flag = False
+    """Print nothing but errors."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Resume:
+    """Go on with a run that was interrupted, was killed, or is to be longer: bit for bit as if it had never ended."""
+
+    folder: Folder
+    """Of the run."""
+    num_episodes: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: as before)")] = None
+    """Episodes after which training ends."""
+    quiet: Flag = False
+    """Print nothing but errors."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Watch:
+    """Watch the agent play: in a window, or, without a display, in a GIF."""
+
+    folder: Folder
+    """Of the run; the GIF goes there, too."""
+    episodes: int = 3
+    """How many to show in the window; the GIF holds the first."""
+    seed: int = 0
+    """Of the starts, which are none of training's."""
+    gif: Flag = False
+    """Write the GIF even where there is a display."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Evaluate:
+    """Let the agent play greedily, from starts that training has not seen."""
+
+    folder: Folder
+    """Of the run."""
+    episodes: int = 100
+    """How many."""
+    seed: int = 0
+    """Of the starts."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Study(_Task):
+    """Train an agent for each of many seeds, on all cores: how reliable is it?"""
+
+    seeds: int = 100
+    """How many: 0, 1, 2, ..."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: runs/ENV-study)")] = None
+    """Where to keep the study: study.npz and study.png. The same command again does only what is missing."""
+    workers: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: one for each core)")] = None
+    """Processes."""
+    quiet: Flag = False
+    """Print nothing but errors and the result."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Plot:
+    """Draw the curves of a run or a study; of a run also while it is going on."""
+
+    folder: Folder
+    """Of the run or the study; the picture goes there, as curve.png or study.png."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line: -> 0, 2 after an error (one line on standard error), or 130 after Ctrl-C."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments == ["--version"]:
+        print(f"dqn_keras {__version__}")
+        return 0
+    command = _parse(arguments)
+    if isinstance(command, int):
+        return command
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    sys.path.insert(0, os.getcwd())  # where MODULE:ID looks, however this was started
+    try:
+        from dqn_keras import commands
+
+        warnings.formatwarning = lambda message, *_: f"dqn-keras: {message}\n"
+        return getattr(commands, type(command).__name__.lower())(command)
+    except KeyboardInterrupt:
+        print("Interrupted", file=sys.stderr)
+        return 130
+    except Exception as error:
+        if not _says_it_all(error):
+            raise
+        return _error(str(error))
+
+
+def _says_it_all(error: Exception) -> bool:
+    """Whether the message is enough; an error in an environment's own code (which has a note) needs its traceback."""
+    import gymnasium as gym
+
+    known = (ValueError, TypeError, OSError, ImportError, gym.error.Error)
+    return isinstance(error, known) and not hasattr(error, "__notes__")
+
+
+def _error(message: str) -> int:
+    print(f"dqn-keras: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def _parse(arguments: Sequence[str]) -> Any:
+    """The command; or, after `--help` or an error, the exit code."""
+    said = io.StringIO()
+    commands: Any = Train | Resume | Watch | Evaluate | Study | Plot
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                commands,
+                prog="dqn-keras",
+                description="Train Deep Q-Networks on Gymnasium's environments.",
+                args=arguments,
+            )
+    except SystemExit as end:
+        return _error(_in_one_line(said.getvalue())) if end.code else 0
+
+
+def _in_one_line(box: str) -> str:
+    """What tyro says in a box of several lines."""
+    text = " ".join(line.strip("│ ") for line in box.splitlines() if line.startswith("│"))
+    problem, *advice = re.split(r"\s*─{3,}\s*", text)
+    problem = re.sub(r"^Error parsing (__tyro\S+ )?", "", problem)
+    meant = re.match(r"Perhaps you meant: (\S+)", advice[0]) if advice else None
+    return f"{problem}{f'; perhaps you meant {meant[1]}' if meant else ''} (see dqn-keras --help)"

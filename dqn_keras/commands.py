@@ -1,0 +1,130 @@
+"""What the commands of the command line do: each takes its options, and returns its exit code."""
+
+import contextlib
+import os
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dqn_keras import run_folder
+from dqn_keras.agent import checked_seed
+from dqn_keras.config import count
+from dqn_keras.evaluation import evaluate as play_greedily
+from dqn_keras.rendering import record_episode, save_animation
+from dqn_keras.run_folder import Recipe, Settings
+from dqn_keras.study import study as train_seeds
+from dqn_keras.study import summarize
+from dqn_keras.training import Run
+
+if TYPE_CHECKING:
+    from dqn_keras import cli
+
+
+def train(options: "cli.Train") -> int:
+    """Train in a new folder."""
+    seed = checked_seed(options.seed)
+    folder = options.out or _default_folder(options.env, str(seed))
+    settings = Settings(_recipe(options), seed, options.config, options.tensorboard)
+    return _tell(run_folder.begin(folder, settings, _verbosity(options.quiet)), folder, options.quiet)
+
+
+def resume(options: "cli.Resume") -> int:
+    """Go on in a folder."""
+    run = run_folder.resume(options.folder, options.num_episodes, _verbosity(options.quiet))
+    return _tell(run, options.folder, options.quiet)
+
+
+def watch(options: "cli.Watch") -> int:
+    """Play in a window, or into a GIF."""
+    settings, network = run_folder.read_settings(options.folder), run_folder.read_agent(options.folder)
+    max_steps = settings.config.max_steps
+    if _has_display() and not options.gif:
+        with contextlib.closing(settings.recipe.make(render_mode="human")) as env:
+            _print_returns(play_greedily(env, network, options.episodes, options.seed, max_steps))
+        return 0
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pictures are drawn without a display
+    with contextlib.closing(settings.recipe.make(render_mode="rgb_array")) as env:
+        frames = record_episode(env, network, options.seed, max_steps)
+        fps = env.metadata.get("render_fps", 30)
+    path = options.folder / "episode.gif"
+    save_animation(frames, path, fps=fps)
+    print(f"An episode of {len(frames) - 1} steps is in {path}")
+    return 0
+
+
+def evaluate(options: "cli.Evaluate") -> int:
+    """Play greedily."""
+    settings, network = run_folder.read_settings(options.folder), run_folder.read_agent(options.folder)
+    with contextlib.closing(settings.recipe.make()) as env:
+        _print_returns(play_greedily(env, network, options.episodes, options.seed, settings.config.max_steps))
+    return 0
+
+
+def study(options: "cli.Study") -> int:
+    """Train many seeds."""
+    folder = options.out or _default_folder(options.env, "study")
+    outcome = train_seeds(
+        _recipe(options).make_for_training(),
+        options.config,
+        range(count("seeds", options.seeds)),
+        file=folder / "study.npz",
+        num_workers=options.workers,
+        verbose=0 if options.quiet else 1,
+    )
+    if len(outcome.outcomes) < options.seeds:
+        return _interrupted("the same command again")
+    summary = summarize(outcome)
+    print(f"Share of seeds solved within {options.config.num_episodes:,} episodes: {summary.share_solved}")
+    print(f"Episodes to solved: median {summary.median}, mean of the middle half {summary.interquartile_mean}")
+    print(f"The numbers in brackets are 95 % intervals; the curves are in {run_folder.draw(folder)}")
+    return 0
+
+
+def plot(options: "cli.Plot") -> int:
+    """Draw the picture of a folder."""
+    print(f"The curves are in {run_folder.draw(options.folder)}")
+    return 0
+
+
+def _recipe(options: "cli.Train | cli.Study") -> Recipe:
+    return Recipe.parse(options.env, options.env_args, options.flatten, options.compiled)
+
+
+def _default_folder(env_id: str, name: str) -> Path:
+    return Path("runs", f"{env_id.replace('/', '-').replace(':', '-')}-{name}")
+
+
+def _tell(run: Run, folder: Path, quiet: bool) -> int:
+    """Say how a run has ended."""
+    if run.interrupted:
+        return _interrupted(f"dqn-keras resume {shlex.quote(str(folder))}")
+    if not quiet:
+        if run.solved_at is None:
+            print(f"Not solved within {len(run.rewards):,} episodes")
+        print(f"The run is in {folder}; its curves are in curve.png")
+    return 0
+
+
+def _interrupted(how: str) -> int:
+    print(f"Interrupted; what there is has been kept. To go on: {how}", file=sys.stderr)
+    return 130
+
+
+def _print_returns(returns: np.ndarray) -> None:
+    print(
+        f"{len(returns)} greedy episodes: mean return {returns.mean():.1f}, standard deviation {returns.std():.1f}, "
+        f"lowest {returns.min():g}, highest {returns.max():g}"
+    )
+
+
+def _verbosity(quiet: bool) -> int:
+    return 0 if quiet else 2 if sys.stderr.isatty() else 1
+
+
+def _has_display() -> bool:
+    if os.environ.get("SDL_VIDEODRIVER") == "dummy":
+        return False
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,0 +1,187 @@
+"""The folder of a run of the command line: what is in it, and how a run begins there and goes on."""
+
+import ast
+import csv
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import matplotlib.pyplot as plt
+
+from dqn_keras import environments
+from dqn_keras._tensorflow import keras
+from dqn_keras.checkpoint import load_agent, replacing, versions
+from dqn_keras.config import Config
+from dqn_keras.plotting import plot_history, plot_study
+from dqn_keras.study import load_study
+from dqn_keras.training import Run, check_environment, train
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """What an environment is made from."""
+
+    id: str
+    arguments: dict[str, Any]
+    flatten: bool
+    compiled: bool
+
+    @classmethod
+    def parse(cls, id: str, arguments: Sequence[str], flatten: bool, compiled: bool) -> "Recipe":
+        """Of the command line's words; ValueError if there is no such functional twin, or a word is no assignment."""
+        if compiled and (id not in environments.TWINS or arguments or flatten):
+            raise ValueError(
+                f"compiled episodes are for {', '.join(environments.TWINS)} as they are, without arguments or flatten, "
+                f"got {' '.join([id, *arguments])}"
+            )
+        values = {}
+        for word in arguments:
+            name, is_assignment, value = word.partition("=")
+            if not (is_assignment and name.isidentifier()):
+                raise ValueError(f"env_args must be of the form NAME=VALUE, got {word!r}")
+            try:
+                values[name] = ast.literal_eval(value)
+            except (ValueError, SyntaxError):
+                values[name] = value
+        return cls(id, values, flatten, compiled)
+
+    def make(self, render_mode: str | None = None) -> gym.Env:
+        """The Gymnasium environment."""
+        rendering = {} if render_mode is None else {"render_mode": render_mode}  # not all environments know the word
+        env = gym.make(self.id, **rendering, **self.arguments)
+        if self.flatten:
+            return gym.wrappers.FlattenObservation(env)
+        if not isinstance(env.observation_space, gym.spaces.Box):
+            space = env.observation_space
+            raise ValueError(f"{self.id} has the observation space {space}; --flatten makes one axis of it")
+        return env
+
+    def make_for_training(self) -> Any:
+        """The same, or its functional twin."""
+        return environments.TWINS[self.id]() if self.compiled else self.make()
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What config.json holds."""
+
+    recipe: Recipe
+    seed: int
+    config: Config
+    tensorboard: bool
+
+
+def write_settings(folder: Path, settings: Settings) -> None:
+    """Write config.json, with the versions that the run is made with."""
+    content = {
+        "environment": dataclasses.asdict(settings.recipe),
+        "seed": settings.seed,
+        "config": dataclasses.asdict(settings.config),
+        "tensorboard": settings.tensorboard,
+        "versions": versions(),
+    }
+    with replacing(folder / "config.json") as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def read_settings(folder: Path) -> Settings:
+    """Read config.json; an error that says if there is none, or what is wrong in it."""
+    path = folder / "config.json"
+    if not path.exists():
+        raise FileNotFoundError(f"{folder} holds no run: there is no config.json in it")
+    try:
+        content = json.loads(path.read_text())
+        config = {**content["config"], "hidden_units": tuple(content["config"]["hidden_units"])}
+        recipe = Recipe(**content["environment"])
+        return Settings(recipe, content["seed"], Config(**config), content["tensorboard"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is not as `dqn-keras train` writes it: {error}") from None
+
+
+def read_agent(folder: Path) -> keras.Model:
+    """The network of a run that has ended."""
+    if not (folder / "agent.keras").exists():
+        raise FileNotFoundError(f"{folder} has no agent.keras yet: dqn-keras resume {folder} goes on to the end")
+    return load_agent(folder / "agent.keras")
+
+
+def begin(folder: Path, settings: Settings, verbose: int) -> Run:
+    """Train in a folder that holds no run yet."""
+    if (folder / "config.json").exists():
+        raise ValueError(
+            f"{folder} holds a run already: `dqn-keras resume {folder}` goes on with it, another --out begins anew"
+        )
+    env = settings.recipe.make_for_training()
+    check_environment(env)  # before there is a folder
+    folder.mkdir(parents=True, exist_ok=True)
+    write_settings(folder, settings)
+    return _train(folder, env, settings, verbose, resume=False)
+
+
+def resume(folder: Path, num_episodes: int | None, verbose: int) -> Run:
+    """Go on with a run, or with more episodes than it was to have."""
+    settings = read_settings(folder)
+    if num_episodes is not None:
+        config = dataclasses.replace(settings.config, num_episodes=num_episodes)
+        settings = dataclasses.replace(settings, config=config)
+    run = _train(folder, settings.recipe.make_for_training(), settings, verbose, resume=True)
+    write_settings(folder, settings)
+    return run
+
+
+def _train(folder: Path, env: Any, settings: Settings, verbose: int, resume: bool) -> Run:
+    log = folder / "log.csv"
+    _tidy(log)
+    callbacks = [keras.callbacks.CSVLogger(log, append=True)]
+    if settings.tensorboard:
+        callbacks.append(keras.callbacks.TensorBoard(folder / "tensorboard"))
+    run = train(
+        env,
+        settings.config,
+        settings.seed,
+        callbacks=callbacks,
+        checkpoint=folder / "checkpoint",
+        resume=resume,
+        verbose=verbose,
+    )
+    _tidy(log)
+    run.save(folder / "agent.keras")
+    draw(folder)
+    return run
+
+
+def _tidy(log: Path) -> None:
+    """One whole line for each episode: a killed run may have left half a line, a resumed one plays some again."""
+    if not log.exists():
+        return
+    header, *lines = [line for line in log.read_text().splitlines(keepends=True) if line.endswith("\n")] or [""]
+    by_episode = {int(line.split(",")[0]): line for line in lines}
+    with replacing(log) as temporary:
+        temporary.write_text(header + "".join(by_episode[episode] for episode in sorted(by_episode)))
+
+
+def read_log(folder: Path) -> dict[str, list[float]]:
+    """The columns of log.csv, as `run.history`."""
+    with (folder / "log.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if None not in row.values()]
+    names = [name for name in (rows[0] if rows else ()) if name != "epoch" and not name.startswith("val_")]
+    return {name: [float(row[name]) for row in rows] for name in names}  # Keras adds val_ columns, all empty
+
+
+def draw(folder: Path) -> Path:
+    """Draw study.png or curve.png, from what the folder holds."""
+    if (folder / "study.npz").exists():
+        axes, path = plot_study(load_study(folder / "study.npz"), published=None), folder / "study.png"
+    else:
+        config = read_settings(folder).config
+        history = read_log(folder)
+        if not history:
+            raise ValueError(f"{folder} has no episode yet")
+        axes, path = plot_history(history, config), folder / "curve.png"
+    with replacing(path) as temporary:
+        axes[0].figure.savefig(temporary, dpi=120)
+    plt.close(axes[0].figure)
+    return path

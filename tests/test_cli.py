@@ -1,0 +1,258 @@
+"""The command line, as a user types it."""
+
+import csv
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from PIL import Image
+
+from dqn_keras import Config, evaluate, load_agent, load_study, train
+from dqn_keras.cli import main
+from dqn_keras.environments import CartPole
+
+SHORT = "--num-episodes 12 --batch-size 16 --solved-reward 1000 --quiet"
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    for name in ("MPLBACKEND", "TF_CPP_MIN_LOG_LEVEL", "PYGAME_HIDE_SUPPORT_PROMPT", "SDL_VIDEODRIVER"):
+        monkeypatch.setenv(name, os.environ.get(name, {"SDL_VIDEODRIVER": "dummy", "MPLBACKEND": "Agg"}.get(name, "3")))
+
+
+def dqn_keras(line):
+    return main(shlex.split(line))
+
+
+def log(folder):
+    return list(csv.DictReader(Path(folder, "log.csv").open()))
+
+
+def test_help_does_not_wait_for_tensorflow():
+    script = """
+import sys
+from dqn_keras.cli import main
+for arguments in (["--help"], ["train", "--help"], ["--version"]):
+    assert main(arguments) == 0
+assert main(["train", "CartPole-v1", "--tau", "2"]) == 2
+assert not {"tensorflow", "keras", "gymnasium", "matplotlib"} & sys.modules.keys()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    for word in ("evaluate", "--hidden-units", "Adam's learning rate, in (0, 1]", "--compiled", "dqn_keras 0."):
+        assert word in done.stdout
+
+
+def test_the_installed_command_and_the_module_are_the_same():
+    commands = [[Path(sys.executable).with_name("dqn-keras")], [sys.executable, "-m", "dqn_keras"]]
+    first, second = (subprocess.run([*x, "plot", "nowhere"], capture_output=True, text=True) for x in commands)
+    assert first.returncode == second.returncode == 2
+    assert first.stderr == second.stderr == "dqn-keras: nowhere holds no run: there is no config.json in it\n"
+
+
+def test_a_run_folder_holds_what_one_expects():
+    assert dqn_keras(f"train CartPole-v1 --seed 3 --tau 0.005 --hidden-units 8 4 --out runs/a {SHORT}") == 0
+    names = {path.name for path in Path("runs/a").iterdir()}
+    assert names == {"config.json", "log.csv", "agent.keras", "checkpoint", "curve.png"}
+    content = json.loads(Path("runs/a/config.json").read_text())
+    assert content["seed"] == 3
+    assert (content["config"]["tau"], content["config"]["hidden_units"]) == (0.005, [8, 4])
+    assert {"tensorflow", "keras", "numpy", "gymnasium", "python", "dqn_keras"} <= content["versions"].keys()
+    config = Config(tau=0.005, hidden_units=(8, 4), num_episodes=12, batch_size=16, solved_reward=1000)
+    run = train(gym.make("CartPole-v1"), config, seed=3, verbose=0)
+    assert [float(row["reward"]) for row in log("runs/a")] == run.rewards.tolist()
+    for kept, ours in zip(load_agent("runs/a/agent.keras").get_weights(), run.q_network.get_weights(), strict=True):
+        np.testing.assert_array_equal(kept, ours)
+    with Image.open("runs/a/curve.png") as picture:
+        assert picture.width > 1000
+
+
+def test_compiled_episodes_are_those_of_the_functional_twin():
+    assert dqn_keras(f"train CartPole-v1 --seed 3 --compiled --tensorboard {SHORT}") == 0
+    config = Config(num_episodes=12, batch_size=16, solved_reward=1000)
+    rewards = train(CartPole(), config, seed=3, verbose=0).rewards.tolist()
+    assert [float(row["reward"]) for row in log("runs/CartPole-v1-3")] == rewards
+    assert list(Path("runs/CartPole-v1-3/tensorboard").rglob("*tfevents*"))
+
+
+def test_the_agent_is_evaluated_and_watched(capsys):
+    dqn_keras(f"train CartPole-v1 --seed 0 --out a {SHORT}")
+    assert dqn_keras("evaluate a --episodes 5 --seed 1") == 0
+    returns = evaluate(gym.make("CartPole-v1"), load_agent("a/agent.keras"), 5, seed=1)
+    assert capsys.readouterr().out.startswith(
+        f"5 greedy episodes: mean return {returns.mean():.1f}, standard deviation"
+    )
+    assert dqn_keras("watch a --seed 1") == 0
+    assert capsys.readouterr().out == f"An episode of {returns[0]:.0f} steps is in a/episode.gif\n"
+    with Image.open("a/episode.gif") as picture:
+        assert picture.is_animated
+
+
+def test_the_agent_is_watched_in_a_window_where_there_is_a_display(capsys, monkeypatch):
+    dqn_keras(f"train FrozenLake-v1 --flatten --seed 0 --out a {SHORT}")
+    made, make = [], gym.make
+
+    def made_for_eyes(*arguments, render_mode=None, **others):
+        made.append(render_mode)
+        return make(*arguments, **others)
+
+    monkeypatch.setattr(gym, "make", made_for_eyes)
+    monkeypatch.delenv("SDL_VIDEODRIVER")
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert dqn_keras("watch a --episodes 2") == 0
+    assert made == ["human"]
+    assert capsys.readouterr().out.startswith("2 greedy episodes: mean return")
+
+
+def test_environments_take_arguments_and_wrappers(tmp_path):
+    line = f"train FrozenLake-v1 --flatten --env-args is_slippery=False map_name=8x8 --seed 0 --out a {SHORT}"
+    assert dqn_keras(line) == 0
+    assert load_agent("a/agent.keras").input_shape == (None, 64)
+    assert dqn_keras("evaluate a --episodes 2") == 0
+    Path("my_environments.py").write_text(
+        "import gymnasium as gym\nfrom tests.environments import Corridor\n"
+        "gym.register('Corridor-v0', Corridor, max_episode_steps=9)\n"
+    )
+    assert dqn_keras(f"train my_environments:Corridor-v0 --env-args length=5 --seed 1 {SHORT}") == 0
+    assert Path("runs/my_environments-Corridor-v0-1/agent.keras").exists()
+
+
+def test_a_study_is_kept_gone_on_with_and_drawn(capsys):
+    line = "study CartPole-v1 --compiled --out s --workers 1 --num-episodes 60 --solved-reward 10 --quiet"
+    assert dqn_keras(f"{line} --seeds 2") == 0
+    assert "Share of seeds solved within 60 episodes: 1.000" in capsys.readouterr().out
+    assert dqn_keras(f"{line} --seeds 3") == 0
+    assert load_study("s/study.npz").seeds.tolist() == [0, 1, 2]
+    Path("s/study.png").unlink()
+    assert dqn_keras("plot s") == 0
+    assert Path("s/study.png").exists()
+
+
+def test_a_longer_run_is_the_run_that_had_been_longer_from_the_start():
+    dqn_keras(f"train CartPole-v1 --seed 3 --out whole {SHORT}")
+    dqn_keras(f"train CartPole-v1 --seed 3 --out parts {SHORT} --num-episodes 7")
+    assert dqn_keras("resume parts --num-episodes 12 --quiet") == 0
+    assert not differing("whole", "parts")
+
+
+def differing(*folders):
+    """In what the results of two runs differ; the speeds may."""
+    logs = [[{k: v for k, v in row.items() if k != "steps_per_second"} for row in log(folder)] for folder in folders]
+    weights = [load_agent(Path(folder, "agent.keras")).get_weights() for folder in folders]
+    return [
+        name
+        for name, same in (
+            ("log", logs[0] == logs[1]),
+            ("weights", all(map(np.array_equal, *weights))),
+            ("config", len({Path(folder, "config.json").read_text() for folder in folders}) == 1),
+        )
+        if not same
+    ]
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)]
+)
+def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(number, code):
+    options = "--seed 3 --num-episodes 330 --solved-reward 1000"
+    command = [sys.executable, "-m", "dqn_keras", "train", "CartPole-v1", "--out", "run", *options.split()]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        for line in process.stdout:
+            if line.startswith("Episode 200"):
+                break
+        process.send_signal(number)
+        _, said = process.communicate()
+    assert process.returncode == code
+    if code == 130:
+        assert said == "Interrupted; what there is has been kept. To go on: dqn-keras resume run\n"
+        assert {"agent.keras", "curve.png"} <= {path.name for path in Path("run").iterdir()}
+        assert [int(row["epoch"]) for row in log("run")] == list(range(len(log("run"))))
+    else:
+        with Path("run/log.csv").open("a") as file:
+            file.write("999,1.0,0.")  # the power went in the middle of a line
+        assert dqn_keras("plot run") == 0
+    assert 200 <= len(log("run")) < 331
+    assert dqn_keras("resume run --quiet") == 0
+    dqn_keras(f"train CartPole-v1 --out whole {options} --quiet")
+    assert not differing("run", "whole")
+
+
+ERRORS = {
+    "train CartPole-v1 --tua 0.1": "Unrecognized options: --tua, 0.1; perhaps you meant --tau (see dqn-keras --help)",
+    "train CartPole-v1 --tau 3": "tau must be a finite number above 0, at most 1, got 3.0 (see dqn-keras --help)",
+    "train CartPole-v1 --tau x": "--tau: could not convert string to float: 'x' (see dqn-keras --help)",
+    "train": "Missing from dqn-keras train: ENV",
+    "fly": "Unrecognized options: fly",
+    "": "Expected one of {train, resume, watch, evaluate, study, plot}.",
+    "train Nope-v1": "Environment `Nope` doesn't exist.",
+    "train no_module:Nope-v1": "No module named 'no_module'.",
+    "train FrozenLake-v1": "FrozenLake-v1 has the observation space Discrete(16); --flatten makes one axis of it",
+    "train Pendulum-v1": "env Pendulum-v1 has the action space Box(-2.0, 2.0, (1,), float32); supported is Discrete",
+    "train CarRacing-v3 --env-args continuous=False": "env CarRacing-v3 has observations of shape (96, 96, 3)",
+    "train CartPole-v1 --env-args gravity": "env_args must be of the form NAME=VALUE, got 'gravity'",
+    "train CartPole-v1 --env-args wings=2": "CartPoleEnv.__init__() got an unexpected keyword argument 'wings'",
+    "train LunarLander-v3 --compiled": "compiled episodes are for CartPole-v1, Acrobot-v1, MountainCar-v0 as they are",
+    "train CartPole-v1 --seed -1": "seed must be a whole number from 0",
+    "study CartPole-v1 --seeds 0": "seeds must be a whole number from 1",
+    "resume nowhere": "nowhere holds no run: there is no config.json in it",
+    "evaluate nowhere": "nowhere holds no run",
+    "watch nowhere": "nowhere holds no run",
+    "plot nowhere": "nowhere holds no run",
+}
+
+
+@pytest.mark.parametrize(("line", "message"), ERRORS.items(), ids=ERRORS)
+def test_an_error_is_one_clear_line(line, message, capfd):
+    assert dqn_keras(line) == 2
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.startswith(f"dqn-keras: {message}")
+    assert err.count("\n") == 1
+    assert not any(Path.cwd().iterdir())
+
+
+def test_folders_that_are_not_whole_are_told(capfd):
+    dqn_keras(f"train CartPole-v1 --seed 3 --out a {SHORT}")
+    capfd.readouterr()
+    told = []
+
+    def hear(line):
+        assert dqn_keras(line) == 2
+        told.append(capfd.readouterr().err)
+
+    hear(f"train CartPole-v1 --out a {SHORT}")
+    Path("a/agent.keras").unlink()
+    hear("evaluate a")
+    Path("a/log.csv").unlink()
+    hear("plot a")
+    Path("a/config.json").write_text('{"seed": 3}')
+    hear("evaluate a")
+    assert told[0].startswith("dqn-keras: a holds a run already: `dqn-keras resume a` goes on with it")
+    assert told[1].startswith("dqn-keras: a has no agent.keras yet: dqn-keras resume a")
+    assert "a/log.csv" in told[2]
+    assert told[3].startswith("dqn-keras: a/config.json is not as `dqn-keras train` writes it: 'config'")
+
+
+def test_an_error_in_the_environments_own_code_keeps_its_traceback():
+    Path("broken.py").write_text(
+        "import gymnasium as gym\nfrom tests.environments import Corridor\n\n"
+        "def reward(t):\n    raise ValueError('the simulator died')\n\n"
+        "gym.register('Broken-v0', lambda: Corridor(length=9, reward=reward))\n"
+    )
+    with pytest.raises(ValueError, match="the simulator died"):
+        dqn_keras(f"train broken:Broken-v0 --out a {SHORT}")
+
+
+def test_quiet_is_quiet(capfd):
+    dqn_keras(f"train CartPole-v1 --seed 3 --out a {SHORT}")
+    assert capfd.readouterr() == ("", "")
