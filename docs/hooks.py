@@ -17,14 +17,16 @@ ALT_TEXTS = {  # of the pictures in the notebooks, by the tag of their cell
     "save-rewards": "Episode rewards of one run: about 20 for 170 episodes, then a climb to over 225",
     "save-pole": "The moving picture of one greedy episode: the network keeps the pole upright",
     "save-hundred_seeds": "A hundred seeds: learning curves, episodes to solved, share solved by episode",
+    "save-catch_run": "A run at a glance: rewards, Q-values under their bound, TD error, terminal share",
+    "save-catch": "The moving picture of an episode: the paddle catches ball after ball",
     "save-one_collapse": "One seed that got stuck: reward, greedy return, highest Q, share of terminal transitions",
 }
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add what is kept elsewhere in the repository, from where it is."""
-    for path in sorted(ROOT.glob("results/*.*")):
-        files.append(File.generated(config, f"results/{path.name}", abs_src_path=str(path)))
+    for path in sorted(ROOT.glob("results/**/*.*")):
+        files.append(File.generated(config, path.relative_to(ROOT).as_posix(), abs_src_path=str(path)))
     for path in sorted(ROOT.glob("notebooks/*.ipynb")):
         files.append(File.generated(config, f"notebooks/{path.name}", abs_src_path=str(path)))
         pictures: dict[str, bytes] = {}

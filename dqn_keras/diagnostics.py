@@ -5,8 +5,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from dqn_keras._tensorflow import tf
 from dqn_keras.agent import Episode
 from dqn_keras.config import Config
@@ -47,12 +45,35 @@ def sum_up(measures: Sequence[Measures]) -> Measures:
     return Measures(sum(loss) / n, sum(mean_q) / n, max(max_q), sum(td_error) / n)
 
 
-class Log:
-    """The record of a run, episode by episode, as Keras' callbacks are told of it.
+class Logged(NamedTuple):
+    """What callbacks are told of an episode, and `run.history` holds."""
 
-    `q_bound` is what no Q-value can exceed: the discounted return of the highest reward so far, r_max, at every step
-    without end, r_max / (1 - gamma); or, where even r_max is negative, r_max once and then the end.
-    """
+    reward: float
+    """Sum of the episode's rewards, undiscounted."""
+    average_reward: float
+    """Mean over the last `solved_window` episodes, over fewer at the start."""
+    steps: int
+    epsilon: float
+    """With which it was played."""
+    loss: float
+    """Mean over the episode's updates, as are mean_q and td_error; NaN before the first."""
+    mean_q: float
+    """Mean over a batch of max_a Q(s, a)."""
+    max_q: float
+    """The highest of them in any of the episode's batches."""
+    q_bound: float
+    """What no return can exceed: the highest reward so far, r_max, at every step, r_max / (1 - gamma); or, where even
+    r_max is negative, r_max once and then the end."""
+    td_error: float
+    """Mean over a batch of |y - Q(s, a)|."""
+    terminal_share: float
+    """Of the transitions in the memory."""
+    steps_per_second: float
+    """Environment steps, learning included; NaN if the episode was played before a resume."""
+
+
+class Log:
+    """The record of a run, episode by episode, as Keras' callbacks are told of it."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -60,36 +81,44 @@ class Log:
         self._memory: deque[tuple[int, bool]] = deque()
         """Of every episode that the memory holds transitions of: steps, and whether it terminated."""
         self._steps = self._terminated = 0
-        self._max_reward = -np.inf
+        self._max_reward = -math.inf
 
-    def add(self, episode: Episode) -> dict[str, float]:
+    def add(self, episode: Episode, steps_per_second: float) -> Logged:
         """What is known at the end of the next episode."""
+        config = self._config
         self._rewards.append(episode.reward)
         self._max_reward = max(self._max_reward, episode.max_reward)
         self._memory.append((episode.steps, episode.terminated))
         self._steps += episode.steps
         self._terminated += episode.terminated
-        while self._steps - self._memory[0][0] >= self._config.memory_size:  # none of the oldest's is left
+        while self._steps - self._memory[0][0] >= config.memory_size:  # none of the oldest's is left
             steps, terminated = self._memory.popleft()
             self._steps -= steps
             self._terminated -= terminated
-        endless = self._max_reward / (1 - self._config.gamma) if self._config.gamma < 1 else np.inf
-        return {
-            "reward": episode.reward,
-            "average_reward": sum(self._rewards) / len(self._rewards),
-            "steps": episode.steps,
-            "epsilon": episode.epsilon,
-            "loss": episode.loss,
-            "mean_q": episode.mean_q,
-            "max_q": episode.max_q,
-            "q_bound": max(self._max_reward, endless) if self._max_reward else 0.0,
-            "td_error": episode.td_error,
-            "terminal_share": self._terminated / min(self._steps, self._config.memory_size),
-        }
+        return Logged(
+            episode.reward,
+            sum(self._rewards) / len(self._rewards),
+            episode.steps,
+            episode.epsilon,
+            episode.loss,
+            episode.mean_q,
+            episode.max_q,
+            _highest_return(self._max_reward, config.gamma),
+            episode.td_error,
+            self._terminated / min(self._steps, config.memory_size),
+            steps_per_second,
+        )
 
 
-def history(episodes: Sequence[Episode], config: Config) -> dict[str, list[float]]:
+def _highest_return(max_reward: float, gamma: float) -> float:
+    if max_reward <= 0:
+        return max_reward
+    return max_reward / (1 - gamma) if gamma < 1 else math.inf
+
+
+def history(episodes: Sequence[Episode], config: Config, steps_per_second: Sequence[float]) -> dict[str, list[float]]:
     """What `Log` tells of these episodes, name by name, as Keras' `History.history`."""
     log = Log(config)
-    rows = [log.add(episode) for episode in episodes]
-    return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
+    rows = [log.add(*x) for x in zip(episodes, steps_per_second, strict=True)]
+    columns = zip(*rows, strict=True) if rows else [()] * len(Logged._fields)
+    return {name: list(column) for name, column in zip(Logged._fields, columns, strict=True)}

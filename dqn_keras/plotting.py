@@ -37,25 +37,30 @@ def plot_rewards(rewards: Sequence[float] | np.ndarray, ax: Axes | None = None, 
     return ax
 
 
-def plot_run(run: Run) -> np.ndarray:
+def plot_run(run: Run, speed: bool = True) -> np.ndarray:
     """A run at a glance: its rewards, and under them Q-values, TD error, terminal transitions and speed.
 
-    Q-values above their bound are the surest sign that learning goes wrong; what else to look for is in the
-    documentation, "It does not learn". The five Axes are returned in that order.
+    Q-values above their bound say that they are overestimated; what else to look for is in the documentation, "It does
+    not learn". Returns the Axes in that order; `plot_run(run)[0].figure` is the figure, 10 inches wide.
+
+    Args:
+        run: of `train`.
+        speed: show the steps per second, the one thing in it that is not the same each time.
     """
-    return plot_history(run.history, run.config)
+    return plot_history(run.history, run.config, speed)
 
 
-def plot_history(history: Mapping[str, Sequence[float]], config: Config) -> np.ndarray:
+def plot_history(history: Mapping[str, Sequence[float]], config: Config, speed: bool = True) -> np.ndarray:
     """The same from `run.history` alone, or from the columns of a log file."""
     columns = {name: np.asarray(values, np.float64) for name, values in history.items()}
-    figure = plt.figure(figsize=(10, 9), layout="constrained")
-    grid = figure.add_gridspec(3, 2, height_ratios=(1.5, 1, 1))
+    num_rows, num_columns = (2, 2) if speed else (1, 3)
+    figure = plt.figure(figsize=(10, 3.5 + 2.75 * num_rows), layout="constrained")
+    grid = figure.add_gridspec(1 + num_rows, num_columns, height_ratios=(1.4, *[1] * num_rows))
     rewards = plot_rewards(columns["reward"], figure.add_subplot(grid[0, :]))
     rewards.axhline(config.solved_reward, color="black", linestyle=":", linewidth=1, label="Solved")
     rewards.legend(loc="upper left")
-    panels = [figure.add_subplot(grid[i, j], sharex=rewards) for i in (1, 2) for j in (0, 1)]
-    values, errors, terminals, speed = panels
+    cells = [grid[1 + i, j] for i in range(num_rows) for j in range(num_columns)]
+    values, errors, terminals, *others = panels = [figure.add_subplot(cell, sharex=rewards) for cell in cells]
 
     values.plot(columns["mean_q"], color="tab:blue", label="Mean")
     values.plot(columns["max_q"], color="tab:orange", label="Highest")
@@ -65,11 +70,15 @@ def plot_history(history: Mapping[str, Sequence[float]], config: Config) -> np.n
     errors.plot(columns["td_error"], color="tab:blue")
     errors.set(title="TD error", ylabel="Mean of |y - Q(s, a)|", ylim=(0, None))
     terminals.plot(100 * columns["terminal_share"], color="tab:blue")
-    terminals.set(title="Terminal transitions in the memory", xlabel="Episode", ylabel="Share (%)", ylim=(0, None))
-    speed.plot(columns["steps_per_second"], color="tab:blue")
-    speed.set(title="Speed, learning included", xlabel="Episode", ylabel="Env steps per second", ylim=(0, None))
+    terminals.set(title="Terminal transitions", ylabel="Share of the memory (%)", ylim=(0, None))
+    for ax in others:
+        ax.plot(columns["steps_per_second"], color="tab:blue")
+        ax.set(title="Speed, learning included", ylabel="Env steps per second", ylim=(0, None))
     for ax in panels:
         ax.grid(alpha=0.3)
+    for ax in panels[-num_columns:]:
+        ax.set_xlabel("Episode")
+    rewards.locator_params(axis="x", nbins=6)  # of all: they share it
     return np.array([rewards, *panels])
 
 

@@ -50,7 +50,7 @@ class Recipe:
 
     def make(self, render_mode: str | None = None) -> gym.Env:
         """The Gymnasium environment."""
-        rendering = {} if render_mode is None else {"render_mode": render_mode}  # not all environments know the word
+        rendering: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}  # not known to all
         env = gym.make(self.id, **rendering, **self.arguments)
         if self.flatten:
             return gym.wrappers.FlattenObservation(env)
@@ -167,8 +167,7 @@ def read_log(folder: Path) -> dict[str, list[float]]:
     """The columns of log.csv, as `run.history`."""
     with (folder / "log.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if None not in row.values()]
-    names = [name for name in (rows[0] if rows else ()) if name != "epoch" and not name.startswith("val_")]
-    return {name: [float(row[name]) for row in rows] for name in names}  # Keras adds val_ columns, all empty
+    return {name: [float(row[name]) for row in rows] for name in (rows[0] if rows else ()) if name != "epoch"}
 
 
 def draw(folder: Path) -> Path:

@@ -17,7 +17,7 @@ from dqn_keras._tensorflow import keras
 from dqn_keras.agent import Agent, DivergedError, Episode, checked_seed, make_agent
 from dqn_keras.checkpoint import Checkpoints, save_agent
 from dqn_keras.config import Config, count
-from dqn_keras.diagnostics import Log, history
+from dqn_keras.diagnostics import Log, Logged, history
 from dqn_keras.environment import CheckedEnv, Spaces
 from dqn_keras.interruption import stop_requests
 from dqn_keras.learn import loss_values
@@ -57,7 +57,7 @@ class Run:
     @property
     def history(self) -> dict[str, list[float]]:
         """What callbacks were told, a list for each name, as `history` of what Keras' `model.fit` returns."""
-        return {**history(self.episodes, self.config), "steps_per_second": list(self.steps_per_second)}
+        return history(self.episodes, self.config, self.steps_per_second)
 
     @property
     def seed(self) -> int:
@@ -297,9 +297,12 @@ def _with_callbacks(
         for callback in listeners.callbacks:  # the list's own methods take 50 us: they look for tensors in the logs
             getattr(callback, event)(number, logs)
 
-    for episode in agent.episodes:
-        log.add(episode)
+    for episode, speed in zip(agent.episodes, steps_per_second, strict=True):
+        log.add(episode, speed)
     listeners.on_train_begin()
+    for callback in listeners.callbacks:
+        if isinstance(callback, keras.callbacks.CSVLogger):
+            callback.keys = sorted(Logged._fields)  # or it adds an empty column val_NAME to each, which costs as much
     try:
         for number in range(len(agent.episodes), config.num_episodes):
             tell("on_epoch_begin", number, {})
@@ -309,7 +312,7 @@ def _with_callbacks(
             except DivergedError:
                 tell("on_train_batch_end", 0, {"loss": math.nan})
                 raise
-            logs = {**log.add(episode), "steps_per_second": steps_per_second[number]}
+            logs = log.add(episode, steps_per_second[number])._asdict()
             tell("on_train_batch_end", 0, {} if math.isnan(episode.loss) else {"loss": episode.loss})
             tell("on_epoch_end", number, logs)
             yield episode

@@ -43,6 +43,7 @@ def test_csv_logger_writes_the_history_and_changes_nothing(env, tmp_path):
     run = play(env, keras.callbacks.CSVLogger(tmp_path / "log.csv"))
     rows = list(csv.DictReader((tmp_path / "log.csv").open()))
     assert [int(row["epoch"]) for row in rows] == list(range(40))
+    assert rows[0].keys() == {"epoch", *NAMES}
     for name in NAMES:
         np.testing.assert_array_equal([float(row[name]) for row in rows], run.history[name])
     np.testing.assert_array_equal(weights(run), weights(play(env)))  # none at all

@@ -55,7 +55,7 @@ def episode(reward=1.0, steps=10, terminated=True, max_reward=1.0):
 
 def test_the_moving_average_is_over_the_window_of_the_stop_rule():
     log = Log(Config(solved_window=3))
-    assert [log.add(episode(reward))["average_reward"] for reward in (1, 2, 6, 7, 8)] == [1, 1.5, 3, 5, 7]
+    assert [log.add(episode(reward), 1.0).average_reward for reward in (1, 2, 6, 7, 8)] == [1, 1.5, 3, 5, 7]
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_the_moving_average_is_over_the_window_of_the_stop_rule():
 )
 def test_the_bound_is_the_highest_return_that_there_can_be(rewards, gamma, bounds):
     log = Log(Config(gamma=gamma))
-    assert [log.add(episode(max_reward=r))["q_bound"] for r in rewards] == pytest.approx(bounds)
+    assert [log.add(episode(max_reward=r), 1.0).q_bound for r in rewards] == pytest.approx(bounds)
 
 
 def test_both_loops_note_the_highest_reward_and_the_end():

@@ -19,7 +19,7 @@ BLOCKS = [
     for number, (kind, block) in enumerate(BLOCK.findall(page.read_text()), start=1)
 ]
 MADE = {  # by docs/hooks.py, from where it is in the repository
-    *(path.relative_to(ROOT) for path in [*ROOT.glob("results/*.*"), *ROOT.glob("notebooks/*.ipynb")]),
+    *(path.relative_to(ROOT) for path in [*ROOT.glob("results/**/*.*"), *ROOT.glob("notebooks/*.ipynb")]),
     *(path.relative_to(ROOT).with_suffix(".md") for path in ROOT.glob("notebooks/*.ipynb")),
 }
 

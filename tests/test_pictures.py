@@ -5,7 +5,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dqn_keras import animate, evaluate, make_q_network, plot_rewards, record_episode, save_animation
+from dqn_keras import (
+    Config,
+    animate,
+    evaluate,
+    make_q_network,
+    plot_rewards,
+    plot_run,
+    record_episode,
+    save_animation,
+    train,
+)
 
 mpl.use("Agg")
 
@@ -99,3 +109,16 @@ def test_bad_frames_are_refused(frames, tmp_path):
     for fps in (0, -5):
         with pytest.raises(ValueError, match=r"^fps must be a whole number"):
             save_animation(frames, target, fps=fps)
+
+
+@pytest.mark.parametrize("speed", [True, False])
+def test_a_run_at_a_glance_shows_its_history(cartpole, speed):
+    run = train(cartpole, Config(num_episodes=25, batch_size=16), seed=0, verbose=0)
+    rewards, *panels = plot_run(run, speed)
+    shown = [["mean_q", "max_q", "q_bound"], ["td_error"], ["terminal_share"], ["steps_per_second"]][: 3 + speed]
+    np.testing.assert_array_equal(rewards.get_lines()[0].get_ydata(), run.rewards)
+    for ax, names in zip(panels, shown, strict=True):
+        for line, name in zip(ax.get_lines(), names, strict=True):
+            scale = 100 if name == "terminal_share" else 1
+            np.testing.assert_array_equal(line.get_ydata(), scale * np.array(run.history[name]))
+        assert ax.get_title() and ax.get_ylabel()  # noqa: PT018
