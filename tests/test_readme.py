@@ -1,7 +1,10 @@
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+
+from dqn_keras.cli import _parse
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -10,12 +13,19 @@ README = (ROOT / "README.md").read_text()
 @pytest.mark.parametrize(
     "script",
     re.findall(r"```python\n(.*?)```", README, re.DOTALL),
-    ids=["train", "compiled", "own env", "resume", "study", "learn"],
+    ids=["train", "own parts", "compiled", "resume", "study", "learn"],
 )
 def test_the_readmes_scripts_run(script, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
     exec(compile(script, "README.md", "exec"), {})
+
+
+def test_the_readmes_commands_are_ones(capsys):
+    commands = re.findall(r"^dqn-keras (.*)$", README, re.MULTILINE)
+    assert len(commands) == 5
+    for command in commands:
+        assert not isinstance(_parse(shlex.split(command)), int), capsys.readouterr().err
 
 
 def test_the_readmes_links_and_map_name_what_is_there():
