@@ -8,7 +8,7 @@ notebook: .venv/installed
 	$(BIN)/python notebooks/render.py
 
 test: lint
-	$(BIN)/python -m pytest --nbmake
+	$(BIN)/python -m pytest --nbmake --numprocesses 2 --dist loadfile
 
 lint: .venv/installed
 	$(BIN)/ruff check .

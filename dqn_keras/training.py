@@ -91,7 +91,7 @@ def train(
     q_network: keras.Model | None = None,
     loss: Callable = loss_values,
     verbose: int = 1,
-    callbacks: Sequence[keras.callbacks.Callback] = (),
+    callbacks: keras.callbacks.Callback | Sequence[keras.callbacks.Callback] = (),
     checkpoint: str | os.PathLike | None = None,
     checkpoint_every: int = 100,
     resume: bool = False,
@@ -135,6 +135,10 @@ def train(
     check_arguments(env, config, verbose)
     if not callable(loss):
         raise TypeError(f"loss must be a function, got {loss!r}")
+    callbacks = [callbacks] if isinstance(callbacks, keras.callbacks.Callback) else list(callbacks)
+    for callback in callbacks:
+        if not isinstance(callback, keras.callbacks.Callback):
+            raise TypeError(f"callbacks must be Keras callbacks, got {callback!r}")
     if resume and checkpoint is None:
         raise ValueError("resume needs a folder to resume from: checkpoint, got None")
     checkpoint_every = count("checkpoint_every", checkpoint_every)
@@ -169,7 +173,7 @@ def train(
                 try:
                     episode = next(played, None)
                 except DivergedError:
-                    if not agent.q_network.stop_training:
+                    if not (callbacks and agent.q_network.stop_training):
                         raise
                     diverged = True
                     break

@@ -1,3 +1,4 @@
+import importlib
 import os
 import subprocess
 import sys
@@ -12,6 +13,15 @@ def cartpole():
     env = gym.make("CartPole-v1")
     yield env
     env.close()
+
+
+@pytest.fixture
+def script_folder(tmp_path, monkeypatch):
+    """For the scripts of the README and the docs: an empty folder, no window, and studies in this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    monkeypatch.setattr(importlib.import_module("dqn_keras.study"), "cpu_count", lambda: 1)
+    return tmp_path
 
 
 @pytest.fixture

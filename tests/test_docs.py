@@ -25,9 +25,8 @@ MADE = {  # by docs/hooks.py, from where it is in the repository
 
 
 @pytest.mark.parametrize(("block", "runs"), BLOCKS)
-def test_the_code_in_the_docs_runs(block, runs, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MPLBACKEND", "Agg")
+@pytest.mark.usefixtures("script_folder")
+def test_the_code_in_the_docs_runs(block, runs):
     code = compile(block, "docs", "exec")
     if runs:
         exec(code, {})

@@ -15,9 +15,8 @@ README = (ROOT / "README.md").read_text()
     re.findall(r"```python\n(.*?)```", README, re.DOTALL),
     ids=["train", "own parts", "compiled", "resume", "study", "learn"],
 )
-def test_the_readmes_scripts_run(script, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MPLBACKEND", "Agg")
+@pytest.mark.usefixtures("script_folder")
+def test_the_readmes_scripts_run(script):
     exec(compile(script, "README.md", "exec"), {})
 
 
