@@ -79,7 +79,7 @@ def main() -> None:
         returns, history = evaluate(env, run.q_network, 20, seed=0), run.history
         columns = [
             wrong,
-            f"{len(run.rewards)}{'' if run.solved_at is None else ', solved'}",
+            str(len(run.rewards)) if run.solved_at is None else f"solved in {run.solved_at}",
             f"{run.rewards[-50:].mean():.0f}",
             f"{returns.mean():.0f}",
             f"{max(history['max_q'][-50:]):.1f}",

@@ -102,7 +102,13 @@ def _make_learner(state_shape: tuple[int, ...], num_actions: int, config: Config
 
 def _adopt(q_network: keras.Model, config: Config) -> Learner:
     """A network of someone else's: Q-hat starts as its equal."""
-    return _with_optimizer(q_network, copy(q_network), config)
+    if not q_network.trainable_variables:
+        raise ValueError("q_network must have weights that can be trained, got none")
+    try:
+        q_hat_network = copy(q_network)
+    except Exception as error:  # whatever a layer's own code says
+        raise ValueError(f"q_network must be one that Keras can copy, but: {error}") from error
+    return _with_optimizer(q_network, q_hat_network, config)
 
 
 def _with_optimizer(q_network: keras.Model, q_hat_network: keras.Model, config: Config) -> Learner:

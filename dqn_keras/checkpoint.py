@@ -6,6 +6,7 @@ written under another name, flushed to the disk, and only then given its own, so
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import inspect
 import io
@@ -28,7 +29,7 @@ from dqn_keras.agent import Agent, Episode
 from dqn_keras.config import Config
 from dqn_keras.diagnostics import Measures
 from dqn_keras.learn import loss_values
-from dqn_keras.networks import check_network, structure
+from dqn_keras.networks import check_network, python_random_kept, structure
 from dqn_keras.replay import unpack
 from dqn_keras.version import __version__
 
@@ -285,6 +286,8 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(x) for key, x in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
         return [_plain(x) for x in value]
+    if isinstance(value, functools.partial):
+        return [_plain(value.func), _plain(value.args), _plain(value.keywords)]
     if tf.is_tensor(value) or isinstance(value, np.ndarray):
         array = np.asarray(value)
         return [str(array.dtype), list(array.shape), hashlib.sha256(array.tobytes()).hexdigest()]
@@ -333,13 +336,20 @@ def save_agent(path: str | os.PathLike, q_network: keras.Model) -> None:
     """Save the network alone, in Keras' own format; an older file of that name is replaced at once.
 
     Raises:
-        ValueError: `path` does not end in .keras.
+        ValueError: `path` does not end in .keras; the network has a layer of an unregistered class.
         OSError: the disk does not take it.
     """
     path = Path(path)
     if path.suffix != ".keras":
         raise ValueError(f"path must end in .keras, got {str(path)!r}")
-    network = type(q_network).from_config(q_network.get_config())  # which has no optimizer to save
+    try:
+        with python_random_kept():
+            network = type(q_network).from_config(q_network.get_config())  # which has no optimizer to save
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            "q_network has a layer that no file can name: keras.saving.register_keras_serializable() on its class, and "
+            f"get_config in it, make it one ({error})"
+        ) from error
     network.set_weights(q_network.get_weights())
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:

@@ -8,6 +8,7 @@ import dataclasses
 import io
 import os
 import re
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -123,25 +124,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"dqn_keras {__version__}")
         return 0
-    command = _parse(arguments)
-    if isinstance(command, int):
-        return command
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ.setdefault("MPLBACKEND", "Agg")
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    sys.path.insert(0, os.getcwd())  # where MODULE:ID looks, however this was started
+    sys.path.append(os.getcwd())  # where MODULE:ID looks, however this was started
+    command = None
     try:
+        command = _parse(arguments)
+        if isinstance(command, int):
+            return command
         from dqn_keras import commands
 
-        warnings.formatwarning = lambda message, *_: f"dqn-keras: {message}\n"
+        warnings.formatwarning = lambda message, *_: f"dqn-keras: {_in_plain_text(str(message))}\n"
         return getattr(commands, type(command).__name__.lower())(command)
     except KeyboardInterrupt:
-        print("Interrupted", file=sys.stderr)
+        print(f"Interrupted{_how_to_go_on(command)}", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # as by `| head`: nobody reads on
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (for the interpreter's last flush)
+        print(f"dqn-keras: nobody reads the output{_how_to_go_on(command)}", file=sys.stderr)
+        return 141
     except Exception as error:
         if not _says_it_all(error):
             raise
         return _error(str(error))
+
+
+def _how_to_go_on(command: Any) -> str:
+    """What to add, if the run has begun."""
+    folder = getattr(command, "folder", None) or getattr(command, "out", None)
+    is_run = isinstance(command, Train | Resume) and folder is not None and (folder / "config.json").exists()
+    return f". To go on: dqn-keras resume {shlex.quote(str(folder))}" if is_run else ""
 
 
 def _says_it_all(error: Exception) -> bool:
@@ -153,8 +166,13 @@ def _says_it_all(error: Exception) -> bool:
 
 
 def _error(message: str) -> int:
-    print(f"dqn-keras: {' '.join(message.split())}", file=sys.stderr)
+    print(f"dqn-keras: {_in_plain_text(message)}", file=sys.stderr)
     return 2
+
+
+def _in_plain_text(message: str) -> str:
+    """One line, without the colours of a terminal."""
+    return " ".join(re.sub(r"\x1b\[[0-9;]*m", "", message).split())
 
 
 def _parse(arguments: Sequence[str]) -> Any:

@@ -66,6 +66,11 @@ def evaluate(options: "cli.Evaluate") -> int:
 def study(options: "cli.Study") -> int:
     """Train many seeds."""
     folder = options.out or _default_folder(options.env, "study")
+    if options.config.num_episodes < options.config.solved_window:
+        raise ValueError(
+            f"num_episodes must be at least solved_window={options.config.solved_window} in a study, whose curves are "
+            f"means over it, got {options.config.num_episodes}"
+        )
     outcome = train_seeds(
         _recipe(options).make_for_training(),
         options.config,
@@ -121,7 +126,7 @@ def _print_returns(returns: np.ndarray) -> None:
 
 
 def _verbosity(quiet: bool) -> int:
-    return 0 if quiet else 2 if sys.stderr.isatty() else 1
+    return 0 if quiet else 2 if sys.stderr is not None and sys.stderr.isatty() else 1
 
 
 def _has_display() -> bool:

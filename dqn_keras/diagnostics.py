@@ -62,8 +62,8 @@ class Logged(NamedTuple):
     max_q: float
     """The highest of them in any of the episode's batches."""
     q_bound: float
-    """What no return can exceed: the highest reward so far, r_max, at every step, r_max / (1 - gamma); or, where even
-    r_max is negative, r_max once and then the end."""
+    """What no return can exceed, by the rewards seen so far: the highest, r_max, at every step, r_max / (1 - gamma);
+    or, where even r_max is negative, r_max once and then the end."""
     td_error: float
     """Mean over a batch of |y - Q(s, a)|."""
     terminal_share: float

@@ -47,6 +47,12 @@ def loss_values(
     return tf.reduce_mean(tf.square(td_errors(experiences, gamma, q_network, q_hat_network)))
 
 
+def check_loss(loss: Callable) -> None:
+    """TypeError if it is not a function, or something like one."""
+    if not callable(loss) or getattr(loss, "__hash__", None) is None:
+        raise TypeError(f"loss must be a function, or another hashable callable, got {loss!r}")
+
+
 def update_q_hat(q_network: keras.Model, q_hat_network: keras.Model, tau: Any = 0.01) -> None:
     """Move Q-hat's weights a little towards Q's: theta_hat <- tau theta + (1 - tau) theta_hat."""
     tau = as_share("tau", tau)
@@ -110,6 +116,7 @@ def learn(
     """
     check_network("q_network", q_network)
     check_network("q_hat_network", q_hat_network)
+    check_loss(loss)
     learner = Learner(q_network, q_hat_network, optimizer)
     if not tf.executing_eagerly():  # in a tf.function of the caller's, which then compiles it
         with tf.init_scope():

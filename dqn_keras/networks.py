@@ -1,8 +1,9 @@
 """The two networks: Q, which learns, and Q-hat, its slow copy that the targets are computed from."""
 
+import contextlib
 import json
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -64,28 +65,48 @@ def make_networks(
     return q_network, q_hat_network
 
 
-def clone(network: keras.Model, clone_layer: Callable[[keras.Layer], keras.Layer] | None = None) -> keras.Model:
-    """A network of the same configuration, its weights its own; no global random state is moved."""
-    state = random.getstate()  # Keras draws from there for initializers without a seed
+@contextlib.contextmanager
+def python_random_kept() -> Iterator[None]:
+    """Leave Python's global random state as it is: Keras draws from there for initializers without a seed."""
+    state = random.getstate()
     try:
-        return keras.models.clone_model(network, clone_function=clone_layer)
+        yield
     finally:
         random.setstate(state)
 
 
+def clone(network: keras.Model, clone_layer: Callable[[keras.Layer], keras.Layer] | None = None) -> keras.Model:
+    """A network of the same configuration, its weights its own."""
+    with python_random_kept():
+        return keras.models.clone_model(network, clone_function=clone_layer)
+
+
 def structure(network: keras.Model) -> str:
     """Equal for networks of one configuration, but for names and for initializers, which have done their work."""
-    text = json.dumps(_without_names(network.get_config()), sort_keys=True, default=repr)
-    for i, layer in enumerate(network.layers):  # a functional model's layers refer to each other by name
-        text = text.replace(json.dumps(layer.name), f'"layer {i}"')
-    return text
+    return json.dumps(_without_names(network.get_config(), {}), sort_keys=True, default=repr)
 
 
-def _without_names(config: Any) -> Any:
-    if isinstance(config, dict):
-        kept = {k: v for k, v in config.items() if k != "name" and not k.endswith("_initializer")}
-        return {k: v if k == "dtype" else _without_names(v) for k, v in kept.items()}
-    return [_without_names(x) for x in config] if isinstance(config, list | tuple) else config
+def _without_names(config: Any, numbers: dict[str, int]) -> Any:
+    """`numbers` are those of the layers, which refer to each other by name in a functional model."""
+    if isinstance(config, list | tuple):
+        return [_without_names(x, numbers) for x in config]
+    if not isinstance(config, dict):
+        return config
+    if isinstance(layers := config.get("layers"), list):
+        numbers = {layer.get("name", layer["config"].get("name")): i for i, layer in enumerate(layers)}
+    kept = {key: x for key, x in config.items() if key != "name" and not key.endswith("_initializer")}
+    for key, value in kept.items():
+        if key in ("keras_history", "input_layers", "output_layers"):
+            kept[key] = _numbered(value, numbers)
+        elif key != "dtype":
+            kept[key] = _without_names(value, numbers)
+    return kept
+
+
+def _numbered(reference: Any, numbers: dict[str, int]) -> Any:
+    if isinstance(reference, list | tuple):
+        return [_numbered(x, numbers) for x in reference]
+    return numbers.get(reference, reference) if isinstance(reference, str) else reference
 
 
 def copy(network: keras.Model) -> keras.Model:
@@ -168,4 +189,4 @@ def is_all_finite(*tensors: tf.Tensor) -> tf.Tensor:
 
 
 def _without_batch(shape: Any) -> Any:
-    return shape[1:] if isinstance(shape, tuple) else shape
+    return shape[1:] if isinstance(shape, tuple) and shape[0] is None else shape

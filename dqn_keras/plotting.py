@@ -56,7 +56,7 @@ def plot_history(history: Mapping[str, Sequence[float]], config: Config, speed: 
     num_rows, num_columns = (2, 2) if speed else (1, 3)
     figure = plt.figure(figsize=(10, 3.5 + 2.75 * num_rows), layout="constrained")
     grid = figure.add_gridspec(1 + num_rows, num_columns, height_ratios=(1.4, *[1] * num_rows))
-    rewards = plot_rewards(columns["reward"], figure.add_subplot(grid[0, :]))
+    rewards = plot_rewards(columns["reward"], figure.add_subplot(grid[0, :]), window=config.solved_window)
     rewards.axhline(config.solved_reward, color="black", linestyle=":", linewidth=1, label="Solved")
     rewards.legend(loc="upper left")
     cells = [grid[1 + i, j] for i in range(num_rows) for j in range(num_columns)]

@@ -8,6 +8,7 @@ and optimizer of the same configuration, and then called with the variables of a
 import json
 from collections.abc import Callable, Hashable, Sequence
 from numbers import Real
+from types import FunctionType
 from typing import Any, NamedTuple
 
 from dqn_keras._tensorflow import keras, require_xla, tf
@@ -55,13 +56,20 @@ class Learner(NamedTuple):
             del optimizer_config["learning_rate"]  # a variable
         del optimizer_config["name"]
         variables = [(tuple(v.shape), v.dtype, v.trainable) for v in self.variables]
-        networks = structure(self.q_network), structure(self.q_hat_network)
+        networks = self.q_network, self.q_hat_network
         return (
-            *networks,
+            *map(structure, networks),
+            *(_code(layer) for network in networks for layer in network._flatten_layers(include_self=False)),
             type(self.optimizer),
             json.dumps(optimizer_config, sort_keys=True, default=repr),
             tuple(variables),
         )
+
+
+def _code(layer: keras.layers.Layer) -> Hashable:
+    """A class or function of the reader's own may be defined anew under its name, as in a cell that is run again."""
+    activation = getattr(layer, "activation", None)
+    return type(layer), activation if isinstance(activation, FunctionType) else None
 
 
 def _clone_for_xla(layer: keras.layers.Layer) -> keras.layers.Layer:

@@ -1,6 +1,7 @@
 """The folder of a run of the command line: what is in it, and how a run begins there and goes on."""
 
 import ast
+import contextlib
 import csv
 import dataclasses
 import json
@@ -8,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import filelock
 import gymnasium as gym
 import matplotlib.pyplot as plt
 
@@ -15,6 +17,7 @@ from dqn_keras import environments
 from dqn_keras._tensorflow import keras
 from dqn_keras.checkpoint import load_agent, replacing, versions
 from dqn_keras.config import Config
+from dqn_keras.diagnostics import Logged
 from dqn_keras.plotting import plot_history, plot_study
 from dqn_keras.study import load_study
 from dqn_keras.training import Run, check_environment, train
@@ -51,7 +54,13 @@ class Recipe:
     def make(self, render_mode: str | None = None) -> gym.Env:
         """The Gymnasium environment."""
         rendering: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}  # not known to all
-        env = gym.make(self.id, **rendering, **self.arguments)
+        try:
+            env = gym.make(self.id, **rendering, **self.arguments)
+        except (gym.error.Error, ImportError):
+            raise
+        except Exception as error:  # of the environment's own, about arguments that it does not take
+            arguments = "".join(f" {name}={value!r}" for name, value in self.arguments.items())
+            raise ValueError(f"{self.id}{arguments} cannot be made: {type(error).__name__}: {error}") from error
         if self.flatten:
             return gym.wrappers.FlattenObservation(env)
         if not isinstance(env.observation_space, gym.spaces.Box):
@@ -104,7 +113,9 @@ def read_settings(folder: Path) -> Settings:
 def read_agent(folder: Path) -> keras.Model:
     """The network of a run that has ended."""
     if not (folder / "agent.keras").exists():
-        raise FileNotFoundError(f"{folder} has no agent.keras yet: dqn-keras resume {folder} goes on to the end")
+        raise FileNotFoundError(
+            f"{folder} has no agent.keras: its run is going on, or was killed, and dqn-keras resume {folder} goes on"
+        )
     return load_agent(folder / "agent.keras")
 
 
@@ -123,51 +134,74 @@ def begin(folder: Path, settings: Settings, verbose: int) -> Run:
 
 def resume(folder: Path, num_episodes: int | None, verbose: int) -> Run:
     """Go on with a run, or with more episodes than it was to have."""
-    settings = read_settings(folder)
+    before = settings = read_settings(folder)
     if num_episodes is not None:
         config = dataclasses.replace(settings.config, num_episodes=num_episodes)
         settings = dataclasses.replace(settings, config=config)
-    run = _train(folder, settings.recipe.make_for_training(), settings, verbose, resume=True)
+    env = settings.recipe.make_for_training()
     write_settings(folder, settings)
-    return run
+    try:
+        return _train(folder, env, settings, verbose, resume=True)
+    except ValueError:
+        write_settings(folder, before)
+        raise
 
 
 def _train(folder: Path, env: Any, settings: Settings, verbose: int, resume: bool) -> Run:
     log = folder / "log.csv"
-    _tidy(log)
-    callbacks = [keras.callbacks.CSVLogger(log, append=True)]
-    if settings.tensorboard:
-        callbacks.append(keras.callbacks.TensorBoard(folder / "tensorboard"))
-    run = train(
-        env,
-        settings.config,
-        settings.seed,
-        callbacks=callbacks,
-        checkpoint=folder / "checkpoint",
-        resume=resume,
-        verbose=verbose,
-    )
-    _tidy(log)
-    run.save(folder / "agent.keras")
-    draw(folder)
+    try:
+        lock = filelock.FileLock(folder / ".lock", timeout=0).acquire()
+    except filelock.Timeout:
+        raise ValueError(f"{folder} is in use: another process trains there") from None
+    with lock:
+        _write_rows(log, _read_rows(log))  # whole lines only, so that it can be gone on with
+        callbacks = [keras.callbacks.CSVLogger(log, append=True)]
+        if settings.tensorboard:
+            callbacks.append(keras.callbacks.TensorBoard(folder / "tensorboard"))
+        run = train(
+            env,
+            settings.config,
+            settings.seed,
+            callbacks=callbacks,
+            checkpoint=folder / "checkpoint",
+            resume=resume,
+            verbose=verbose,
+        )
+        columns = zip(*run.history.values(), strict=True)
+        known = {episode: dict(zip(run.history, row, strict=True)) for episode, row in enumerate(columns)}
+        _write_rows(log, {**known, **_read_rows(log)})
+        run.save(folder / "agent.keras")
+        draw(folder)
     return run
 
 
-def _tidy(log: Path) -> None:
-    """One whole line for each episode: a killed run may have left half a line, a resumed one plays some again."""
-    if not log.exists():
+def _read_rows(log: Path) -> dict[int, dict[str, float]]:
+    """By episode; of one that was played again after a kill the last row, and none that is not whole."""
+    rows: dict[int, dict[str, float]] = {}
+    if log.exists():
+        with log.open(newline="") as file:
+            for row in csv.DictReader(file):
+                with contextlib.suppress(KeyError, TypeError, ValueError):
+                    values = {name: float(row[name]) for name in Logged._fields}
+                    rows[int(row["epoch"])] = {**values, "steps": int(values["steps"])}
+    return rows
+
+
+def _write_rows(log: Path, rows: dict[int, dict[str, float]]) -> None:
+    """As keras.callbacks.CSVLogger writes them."""
+    if not rows:
+        log.unlink(missing_ok=True)
         return
-    header, *lines = [line for line in log.read_text().splitlines(keepends=True) if line.endswith("\n")] or [""]
-    by_episode = {int(line.split(",")[0]): line for line in lines}
-    with replacing(log) as temporary:
-        temporary.write_text(header + "".join(by_episode[episode] for episode in sorted(by_episode)))
+    with replacing(log) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["epoch", *sorted(Logged._fields)])
+        writer.writeheader()
+        writer.writerows({"epoch": episode, **rows[episode]} for episode in sorted(rows))
 
 
 def read_log(folder: Path) -> dict[str, list[float]]:
-    """The columns of log.csv, as `run.history`."""
-    with (folder / "log.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if None not in row.values()]
-    return {name: [float(row[name]) for row in rows] for name in (rows[0] if rows else ()) if name != "epoch"}
+    """What log.csv holds, as `run.history`."""
+    rows = _read_rows(folder / "log.csv")
+    return {name: [rows[episode][name] for episode in sorted(rows)] for name in Logged._fields}
 
 
 def draw(folder: Path) -> Path:
@@ -177,8 +211,8 @@ def draw(folder: Path) -> Path:
     else:
         config = read_settings(folder).config
         history = read_log(folder)
-        if not history:
-            raise ValueError(f"{folder} has no episode yet")
+        if not history["reward"]:
+            raise ValueError(f"{folder} has no episode in log.csv yet")
         axes, path = plot_history(history, config), folder / "curve.png"
     with replacing(path) as temporary:
         axes[0].figure.savefig(temporary, dpi=120)

@@ -301,6 +301,8 @@ class Estimate(NamedTuple):
 
     def __str__(self) -> str:
         digits = 1 if abs(self.value) >= 10 else 3
+        if np.isnan(self.low):  # nothing to tell an interval from
+            return f"{self.value:.{digits}f}"
         return f"{self.value:.{digits}f} ({self.low:.{digits}f} to {self.high:.{digits}f})"
 
 

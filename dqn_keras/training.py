@@ -20,7 +20,7 @@ from dqn_keras.config import Config, count
 from dqn_keras.diagnostics import Log, Logged, history
 from dqn_keras.environment import CheckedEnv, Spaces
 from dqn_keras.interruption import stop_requests
-from dqn_keras.learn import loss_values
+from dqn_keras.learn import check_loss, loss_values
 from dqn_keras.networks import check_fits
 from dqn_keras.progress import tqdm
 
@@ -120,9 +120,9 @@ def train(
         checkpoint_every: episodes between two of them, or a few more where episodes are compiled; the start and the
             end of the run are saved too.
         resume: go on from the newest checkpoint in the folder that is whole, or start if there is none yet. The
-            result is that of a run that was never interrupted, bit for bit; `config`, `env`, `loss` and the layers of
-            `q_network` must be the same, but for a num_episodes that may be larger. What callbacks remember is theirs
-            to save.
+            result is that of a run that was never interrupted, bit for bit; `config`, `env`, `loss` (which is known
+            by its name) and the layers of `q_network` must be the same, but for a num_episodes that may be larger.
+            What callbacks remember is theirs to save.
 
     Ctrl-C, an interrupted notebook cell and SIGTERM end the run at the end of an episode, saved if there is a
     checkpoint, and `train` returns what there is, marked `interrupted`; a second one raises KeyboardInterrupt.
@@ -133,8 +133,7 @@ def train(
             step); learning diverged.
     """
     check_arguments(env, config, verbose)
-    if not callable(loss):
-        raise TypeError(f"loss must be a function, got {loss!r}")
+    check_loss(loss)
     callbacks = [callbacks] if isinstance(callbacks, keras.callbacks.Callback) else list(callbacks)
     for callback in callbacks:
         if not isinstance(callback, keras.callbacks.Callback):

@@ -10,6 +10,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import filelock
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -63,7 +64,7 @@ def test_the_installed_command_and_the_module_are_the_same():
 def test_a_run_folder_holds_what_one_expects():
     assert dqn_keras(f"train CartPole-v1 --seed 3 --tau 0.005 --hidden-units 8 4 --out runs/a {SHORT}") == 0
     names = {path.name for path in Path("runs/a").iterdir()}
-    assert names == {"config.json", "log.csv", "agent.keras", "checkpoint", "curve.png"}
+    assert names - {".lock"} == {"config.json", "log.csv", "agent.keras", "checkpoint", "curve.png"}
     content = json.loads(Path("runs/a/config.json").read_text())
     assert content["seed"] == 3
     assert (content["config"]["tau"], content["config"]["hidden_units"]) == (0.005, [8, 4])
@@ -200,7 +201,10 @@ ERRORS = {
     "train Pendulum-v1": "env Pendulum-v1 has the action space Box(-2.0, 2.0, (1,), float32); supported is Discrete",
     "train CarRacing-v3 --env-args continuous=False": "env CarRacing-v3 has observations of shape (96, 96, 3)",
     "train CartPole-v1 --env-args gravity": "env_args must be of the form NAME=VALUE, got 'gravity'",
-    "train CartPole-v1 --env-args wings=2": "CartPoleEnv.__init__() got an unexpected keyword argument 'wings'",
+    "train CartPole-v1 --env-args wings=2": "CartPole-v1 wings=2 cannot be made: TypeError: CartPoleEnv.__init__() got",
+    "train LunarLander-v3 --env-args gravity=5": "LunarLander-v3 gravity=5 cannot be made: AssertionError: gravity",
+    "train FrozenLake-v1 --flatten --env-args map_name=9x9": "FrozenLake-v1 map_name='9x9' cannot be made: KeyError",
+    "study CartPole-v1 --num-episodes 20": "num_episodes must be at least solved_window=50 in a study",
     "train LunarLander-v3 --compiled": "compiled episodes are for CartPole-v1, Acrobot-v1, MountainCar-v0 as they are",
     "train CartPole-v1 --seed -1": "seed must be a whole number from 0",
     "study CartPole-v1 --seeds 0": "seeds must be a whole number from 1",
@@ -238,9 +242,43 @@ def test_folders_that_are_not_whole_are_told(capfd):
     Path("a/config.json").write_text('{"seed": 3}')
     hear("evaluate a")
     assert told[0].startswith("dqn-keras: a holds a run already: `dqn-keras resume a` goes on with it")
-    assert told[1].startswith("dqn-keras: a has no agent.keras yet: dqn-keras resume a")
-    assert "a/log.csv" in told[2]
+    assert told[1].startswith(
+        "dqn-keras: a has no agent.keras: its run is going on, or was killed, and dqn-keras resume"
+    )
+    assert told[2] == "dqn-keras: a has no episode in log.csv yet\n"
     assert told[3].startswith("dqn-keras: a/config.json is not as `dqn-keras train` writes it: 'config'")
+
+
+def test_a_folder_is_for_one_process_at_a_time(capfd):
+    dqn_keras(f"train CartPole-v1 --seed 3 --out a {SHORT}")
+    with filelock.FileLock("a/.lock"):
+        assert dqn_keras("resume a") == 2
+    assert capfd.readouterr().err == "dqn-keras: a is in use: another process trains there\n"
+    assert dqn_keras("resume a --quiet") == 0
+
+
+def test_a_log_that_was_lost_or_damaged_is_made_again():
+    dqn_keras(f"train CartPole-v1 --seed 3 --out a {SHORT}")
+    whole = log("a")
+    lines = Path("a/log.csv").read_text().splitlines(keepends=True)
+    Path("a/log.csv").write_text("".join([*lines[:4], "more\n", "5,1,x\n", *lines[8:10], lines[10][:20]]))
+    assert dqn_keras("resume a --quiet") == 0
+    told = [{k: v for k, v in row.items() if k != "steps_per_second"} for row in log("a")]
+    assert told == [{k: v for k, v in row.items() if k != "steps_per_second"} for row in whole]
+
+
+def test_a_longer_run_that_is_refused_changes_nothing():
+    dqn_keras(f"train CartPole-v1 --seed 3 --out a {SHORT}")
+    before = {path: path.read_bytes() for path in Path("a").rglob("*") if path.is_file()}
+    assert dqn_keras("resume a --num-episodes 5") == 2
+    assert {path: path.read_bytes() for path in Path("a").rglob("*") if path.is_file()} == before
+
+
+def test_nobody_reading_is_no_traceback():
+    script = f"{sys.executable} -m dqn_keras train CartPole-v1 --seed 3 --out a --num-episodes 500 | head -1"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True)
+    assert done.stdout.count("\n") == 1
+    assert done.stderr == "dqn-keras: nobody reads the output. To go on: dqn-keras resume a\n"
 
 
 def test_an_error_in_the_environments_own_code_keeps_its_traceback():

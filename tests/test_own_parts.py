@@ -1,5 +1,8 @@
 """A reader's own environment, network and loss."""
 
+import functools
+import random
+
 import gymnasium as gym
 import keras
 import numpy as np
@@ -10,6 +13,8 @@ from gymnasium.wrappers import FlattenObservation, TimeLimit
 
 from dqn_keras import Config, Experience, ReplayMemory, evaluate, learn, load_agent, loss_values, make_networks, train
 from dqn_keras.environments import CartPole
+from dqn_keras.networks import structure
+from dqn_keras.programs import _programs
 from dqn_keras.replay import pack, unpack
 from tests.environments import Corridor
 
@@ -225,6 +230,72 @@ def test_a_run_with_a_network_of_the_readers_own_is_saved_and_gone_on_from(tmp_p
         )
 
 
+def dueling():
+    """A layer's values plus what is above their mean: with an operation that is no layer."""
+    inputs = keras.Input((4,))
+    hidden = keras.layers.Dense(8, activation="relu", kernel_initializer=glorot(1))(inputs)
+    value, advantage = (keras.layers.Dense(n, kernel_initializer=glorot(n))(hidden) for n in (1, 2))
+    return keras.Model(inputs, value + advantage - keras.ops.mean(advantage, axis=-1, keepdims=True))
+
+
+def test_equal_networks_share_a_program_whatever_they_are_called(cartpole, tmp_path):
+    first, second = dueling(), dueling()
+    assert structure(first) == structure(second)
+    whole = train(cartpole, QUICK, seed=0, q_network=first, verbose=0)
+    num_programs = len(_programs)
+    run = train(cartpole, QUICK, seed=0, q_network=second, checkpoint=tmp_path, verbose=0)
+    assert len(_programs) == num_programs
+    np.testing.assert_array_equal(weights(run), weights(whole))
+    train(cartpole, QUICK, seed=0, q_network=dueling(), checkpoint=tmp_path, resume=True, verbose=0)
+
+
+def test_networks_that_differ_do_not_share_one_whatever_they_are_called():
+    def named(activation):
+        hidden = keras.layers.Dense(8, activation, name=activation)
+        return keras.Sequential([keras.Input((4,)), hidden, keras.layers.Dense(2)])
+
+    assert structure(named("tanh")) != structure(named("sigmoid"))
+
+
+def test_a_layer_that_is_defined_anew_is_run_anew(cartpole):
+    def train_with(function):
+        class Bend(keras.layers.Layer):
+            def call(self, inputs):
+                return function(inputs)
+
+        network = keras.Sequential(
+            [
+                keras.Input((4,)),
+                keras.layers.Dense(8, kernel_initializer=glorot(1)),
+                Bend(),
+                keras.layers.Dense(2, kernel_initializer=glorot(2)),
+            ]
+        )
+        return weights(train(cartpole, QUICK, seed=0, q_network=network, verbose=0))
+
+    assert not np.array_equal(train_with(tf.nn.relu), train_with(tf.sin))
+
+
+def test_a_network_of_an_unregistered_class_is_refused_when_it_is_saved(cartpole, tmp_path):
+    class Unregistered(keras.layers.Layer):
+        def call(self, inputs):
+            return inputs
+
+    network = keras.Sequential([keras.Input((4,)), Unregistered(), keras.layers.Dense(2)])
+    run = train(cartpole, QUICK, seed=0, q_network=network, verbose=0)
+    with pytest.raises(
+        ValueError, match=r"^q_network has a layer that no file can name: .*register_keras_serializable"
+    ):
+        run.save(tmp_path / "agent.keras")
+
+
+def test_pythons_random_state_is_left_alone(cartpole, tmp_path):
+    network = keras.Sequential([keras.Input((4,)), keras.layers.Dense(8, "tanh"), keras.layers.Dense(2)])
+    before = random.getstate()
+    train(cartpole, QUICK, seed=0, q_network=network, verbose=0).save(tmp_path / "agent.keras")
+    assert random.getstate() == before
+
+
 def subclassed():
     class Own(keras.Model):
         def call(self, states):
@@ -241,6 +312,12 @@ def subclassed():
         (lambda: convolutional(2), ValueError, r"must map states of shape \(4,\) .*, got input \(6, 6, 1\)"),
         (lambda: keras.Sequential([keras.layers.Dense(2)]), ValueError, "must be a Sequential or functional model"),
         (subclassed, ValueError, "must be a Sequential or functional model with an Input layer"),
+        (lambda: keras.Sequential([keras.Input((2,)), keras.layers.Identity()]), ValueError, "must map states"),
+        (
+            lambda: keras.Sequential([keras.Input(batch_shape=(64, 4)), keras.layers.Dense(2)]),
+            ValueError,
+            r"must map .* got input \(64, 4\) and output \(64, 2\)",
+        ),
         (lambda: "mlp", TypeError, "must be a Keras model, got 'mlp'"),
         (
             lambda: keras.Sequential([keras.Input((4,)), keras.layers.Dense(2, dtype="float16")]),
@@ -327,5 +404,17 @@ def test_a_loss_that_is_none_is_refused(random_batch, cartpole):
     networks, optimizer = make_networks(4, 2, seed=0), keras.optimizers.Adam()
     with pytest.raises(ValueError, match=r"^loss must return a scalar tensor, got shape \(None,\)"):
         learn(random_batch(16), 0.9, *networks, optimizer, loss=lambda *parts: tf.square(parts[0][2]))
-    with pytest.raises(TypeError, match=r"^loss must be a function, got 'mse'"):
+    with pytest.raises(TypeError, match=r"^loss must be a function, or another hashable callable, got 'mse'"):
         train(cartpole, loss="mse")
+
+
+def test_the_arguments_of_a_loss_are_part_of_its_name(cartpole, tmp_path):
+    first, second = (functools.partial(scaled_loss, scale) for scale in (1.0, 2.0))
+    train(cartpole, QUICK, seed=0, loss=first, checkpoint=tmp_path, verbose=0)
+    train(cartpole, QUICK, seed=0, loss=first, checkpoint=tmp_path, resume=True, verbose=0)
+    with pytest.raises(ValueError, match=r"^loss is \['scaled_loss', \[1\.0\].*, got \['scaled_loss', \[2\.0\]"):
+        train(cartpole, QUICK, seed=0, loss=second, checkpoint=tmp_path, resume=True)
+
+
+def scaled_loss(scale, *arguments):
+    return scale * loss_values(*arguments)
