@@ -37,6 +37,8 @@ def require_tensorflow_backend(name: str) -> None:
 
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # errors still show
+# A window that pygame opens with OpenGL kills a process that has TensorFlow in it: both bring an LLVM of their own.
+os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
 require_tensorflow_backend(os.environ.get("KERAS_BACKEND", "tensorflow"))
 with _native_stderr_silenced():
     import keras

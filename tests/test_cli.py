@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -113,6 +114,16 @@ def test_the_agent_is_watched_in_a_window_where_there_is_a_display(capsys, monke
     assert dqn_keras("watch a --episodes 2") == 0
     assert made == ["human"]
     assert capsys.readouterr().out.startswith("2 greedy episodes: mean return")
+
+
+@pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="needs a display, or Xvfb to stand for one")
+def test_a_real_window_opens(capsys):
+    dqn_keras(f"train CartPole-v1 --seed 0 --out a {SHORT}")
+    command = ["xvfb-run", "-a", sys.executable, "-m", "dqn_keras", "watch", "a", "--episodes", "1"]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("SDL_")}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert done.stdout.startswith("1 greedy episodes: mean return")
 
 
 def test_environments_take_arguments_and_wrappers(tmp_path):
