@@ -19,7 +19,7 @@ import numpy as np
 import tensorflow as tf
 from hypothesis import HealthCheck, given, settings
 
-from dqn_keras import Config, compiled_loop, train
+from dqn_keras import Config, compiled_loop, diagnostics, train
 from dqn_keras.agent import make_agent
 from dqn_keras.checkpoint import Checkpoints
 from dqn_keras.environment import CheckedEnv
@@ -99,14 +99,14 @@ def cost_of_compiled_checks(rounds: int = 30) -> dict[str, str]:
     checks, config = compiled_loop.is_all_finite, Config(num_episodes=10**6, epsilon=0.1, solved_reward=1e6)
     loops = []
     for is_all_finite in (checks, lambda *_: tf.constant(True)):
-        compiled_loop.is_all_finite = is_all_finite
+        compiled_loop.is_all_finite = diagnostics.is_all_finite = is_all_finite
         _programs.clear()
         agent = make_agent((4,), 2, config, 0)
         loop = compiled_loop.episodes(CartPole(), compiled_loop.check_functional(CartPole()), agent, config)
         while agent.memory.num_appended < 60_000:
             next(loop)
         loops.append((agent, loop))
-    compiled_loop.is_all_finite = checks
+    compiled_loop.is_all_finite = diagnostics.is_all_finite = checks
     costs = []
     for _ in range(rounds):
         turns = []
