@@ -5,9 +5,10 @@ from .agent import episode_seed as episode_seed
 from .checkpoint import load_agent as load_agent
 from .config import Config as Config
 from .evaluation import evaluate as evaluate
+from .learn import double_td_targets as double_td_targets
 from .learn import learn as learn
 from .learn import loss_values as loss_values
-from .learn import td_errors as td_errors
+from .learn import td_targets as td_targets
 from .learn import update_q_hat as update_q_hat
 from .networks import make_networks as make_networks
 from .networks import make_q_network as make_q_network

@@ -1,7 +1,9 @@
 """The agent: everything that a run changes, and the record of one of its episodes."""
 
+import contextlib
 import dataclasses
-from collections.abc import Hashable
+import weakref
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,18 +73,27 @@ def make_agent(
     config: Config,
     seed: int,
     q_network: keras.Model | None = None,
+    optimizer: keras.Optimizer | None = None,
+    some_states: np.ndarray | None = None,
     dtype: Any = np.float32,
 ) -> Agent:
     """An agent that has seen nothing.
 
-    Weights and random stream follow from `seed` alone, but for the weights of a network that is given.
+    Weights and random stream follow from `seed` alone, but for the weights of a network that is given. That learns
+    with its owner's optimizer if it was compiled, and `some_states` [B, *S] are what its copy is compared on.
     """
-    if q_network is not None:
-        learner = _adopt(q_network, config)
-    elif learner := _recycled.pop((state_shape, num_actions, config.hidden_units), None):  # type: ignore[arg-type]
+    sizes = (*state_shape, *config.hidden_units, num_actions)
+    if q_network is None and optimizer is None and (learner := _recycled.pop(sizes, None)):
         _renew(learner, config, seed)
     else:
-        learner = _make_learner(state_shape, num_actions, config, seed)
+        if q_network is None:
+            (num_features,) = state_shape
+            networks = make_networks(num_features, num_actions, config.hidden_units, _derived(seed, 0))
+        else:
+            networks = q_network, copy(q_network, some_states)
+            optimizer = optimizer or owners_optimizer(q_network)
+        learner = Learner(*networks, _optimizer_for(networks[0], optimizer, config))
+        learner.prepare()
     return Agent(
         seed=seed,
         q_network=learner.q_network,
@@ -94,40 +105,51 @@ def make_agent(
     )
 
 
-def _make_learner(state_shape: tuple[int, ...], num_actions: int, config: Config, seed: int) -> Learner:
-    (num_features,) = state_shape
-    networks = make_networks(num_features, num_actions, config.hidden_units, _derived(seed, 0))
-    return _with_optimizer(*networks, config)
+_compiled_here: weakref.WeakKeyDictionary[keras.Model, keras.Optimizer] = weakref.WeakKeyDictionary()
 
 
-def _adopt(q_network: keras.Model, config: Config) -> Learner:
-    """A network of someone else's: Q-hat starts as its equal."""
-    if not q_network.trainable_variables:
-        raise ValueError("q_network must have weights that can be trained, got none")
+def owners_optimizer(q_network: keras.Model) -> keras.Optimizer | None:
+    """The optimizer that the network was compiled with by whoever made it; None if it was not, or only here."""
+    is_compiled = q_network.compiled and q_network.optimizer is not _compiled_here.get(q_network)
+    return q_network.optimizer if is_compiled else None
+
+
+def _optimizer_for(q_network: keras.Model, optimizer: keras.Optimizer | None, config: Config) -> keras.Optimizer:
+    """The given one, or else Adam. A network that its owner has not compiled is compiled with it.
+
+    Keras' callbacks and .keras files look for the optimizer there.
+    """
+    if optimizer is None or owners_optimizer(q_network) is None:
+        is_adam_of_ours = optimizer is None
+        optimizer = optimizer or keras.optimizers.Adam(learning_rate=config.alpha, name="adam")
+        # In mixed precision, Keras puts a LossScaleOptimizer around it, as it does for `model.fit`.
+        q_network.compile(optimizer=optimizer, loss="mse", auto_scale_loss=is_adam_of_ours)
+        _compiled_here[q_network] = optimizer = q_network.optimizer
+    return optimizer
+
+
+@contextlib.contextmanager
+def optimizer_shown(agent: Agent) -> Iterator[None]:
+    """Within, callbacks find the agent's optimizer in its network, whatever the owner has compiled it with."""
+    network, owners = agent.q_network, agent.q_network.optimizer
+    network.optimizer = agent.optimizer
     try:
-        q_hat_network = copy(q_network)
-    except Exception as error:  # whatever a layer's own code says
-        raise ValueError(f"q_network must be one that Keras can copy, but: {error}") from error
-    return _with_optimizer(q_network, q_hat_network, config)
+        yield
+    finally:
+        network.optimizer = owners
 
 
-def _with_optimizer(q_network: keras.Model, q_hat_network: keras.Model, config: Config) -> Learner:
-    optimizer = keras.optimizers.Adam(learning_rate=config.alpha, name="adam")
-    q_network.compile(optimizer=optimizer, loss="mse")  # Keras' callbacks and .keras files look for it there
-    optimizer.build(q_network.trainable_variables)
-    return Learner(q_network, q_hat_network, optimizer)
+_recycled: dict[tuple[int, ...], Learner] = {}
 
 
-_recycled: dict[Hashable, Learner] = {}
-
-
-def recycle(agent: Agent, config: Config) -> None:
-    """Give up an agent, and have the next one of its shape made in its networks: to build them takes a while."""
-    _recycled[agent.memory.state_shape, agent.q_network.output_shape[-1], config.hidden_units] = agent.learner
+def recycle(agent: Agent) -> None:
+    """Gives up an agent, whose networks the next one of its sizes is made in: to build them takes a while."""
+    if sizes := agent.learner.sizes():
+        _recycled[sizes] = agent.learner
 
 
 def _renew(learner: Learner, config: Config, seed: int) -> None:
-    """Put networks and optimizer back to how `_make_learner` makes them for `seed`."""
+    """Puts networks and optimizer back to how they are made for `seed`."""
     renew_weights(learner.q_network, _derived(seed, 0))
     learner.q_hat_network.set_weights(learner.q_network.get_weights())
     for variable in learner.optimizer.variables:

@@ -5,18 +5,13 @@ written under another name, flushed to the disk, and only then given its own, so
 """
 
 import contextlib
-import dataclasses
-import functools
 import hashlib
-import inspect
 import io
 import json
 import os
-import platform
-import re
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +19,16 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 
-from dqn_keras._tensorflow import keras, tf
+from dqn_keras._tensorflow import keras
 from dqn_keras.agent import Agent, Episode
 from dqn_keras.config import Config
-from dqn_keras.diagnostics import Measures
-from dqn_keras.learn import loss_values
-from dqn_keras.networks import check_network, python_random_kept, structure
+from dqn_keras.identity import check_is_same, identity, warn_of_other_versions
+from dqn_keras.learn import DEFAULT_FORMULAS, Formulas, Metrics
+from dqn_keras.networks import check_is_equal, check_network, finalize_layers, python_random_kept
 from dqn_keras.replay import unpack
 from dqn_keras.version import __version__
 
-FORMAT = 2
+FORMAT = 3
 
 
 class Checkpoints:
@@ -45,10 +40,11 @@ class Checkpoints:
         env: gym.Env | FuncEnv,
         config: Config,
         q_network: keras.Model | None = None,
-        loss: Callable = loss_values,
+        optimizer: keras.Optimizer | None = None,
+        formulas: Formulas = DEFAULT_FORMULAS,
     ) -> None:
         self.folder = Path(folder)
-        self._identity = identity(env, config, q_network, loss)
+        self._identity = identity(env, config, q_network, optimizer, formulas)
         self._kept: list[Path] = []  # the newest first, all known to be whole
 
     def paths(self) -> list[Path]:
@@ -98,42 +94,6 @@ class Checkpoints:
         if damaged:
             raise ValueError(f"checkpoint: {'; '.join(damaged)}")
         return None
-
-
-def identity(
-    env: gym.Env | FuncEnv, config: Config, q_network: keras.Model | None = None, loss: Callable = loss_values
-) -> dict[str, Any]:
-    """What must be the same for a saved state to be gone on from, as a file holds it (versions may differ)."""
-    facts = {
-        "config": dataclasses.asdict(config),
-        "environment": describe(env),
-        "q_network": "the default" if q_network is None else _describe_network(q_network),
-        "loss": _plain(loss),
-        "versions": versions(),
-    }
-    return json.loads(json.dumps(facts))  # tuples become lists
-
-
-def check_is_same(path: Path, theirs: dict[str, Any], ours: dict[str, Any], but_for: Sequence[str] = ()) -> None:
-    """ValueError that begins with the argument of `train`, or field of Config, in which `path` is of another run."""
-    theirs, ours = (
-        {**x["config"], "env": x["environment"], **{name: x.get(name) for name in ("q_network", "loss", "seed")}}
-        for x in (theirs, ours)
-    )
-    for name in [name for name in ours if name not in but_for]:
-        if name not in theirs or theirs[name] != ours[name]:
-            raise ValueError(f"{name} is {theirs.get(name)!r} in {path}, got {ours[name]!r}")
-
-
-def warn_of_other_versions(path: Path, theirs: dict[str, Any], ours: dict[str, Any], stacklevel: int) -> None:
-    """One warning of all versions that differ."""
-    theirs, ours = theirs["versions"], ours["versions"]
-    others = [f"{name} {theirs.get(name)} (here {ours[name]})" for name in ours if theirs.get(name) != ours[name]]
-    if others:
-        warnings.warn(
-            f"{path} was saved with {', '.join(others)}: what is added may differ in its last bits",
-            stacklevel=stacklevel,
-        )
 
 
 class DamagedError(ValueError):
@@ -215,7 +175,7 @@ def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any])
     expected |= {f"episodes/{name}": np.zeros(max(0, num_episodes), dtype) for name, dtype in _COLUMNS.items()}
     expected["memory"] = agent.memory.rows[:num_appended]
     # A run goes on while an average of Adam's overflows, as long as the weights are finite.
-    may_be_infinite = {f"episodes/{name}" for name in Measures._fields} | {
+    may_be_infinite = {f"episodes/{name}" for name in Metrics._fields} | {
         name for name in expected if name.startswith("optimizer/")
     }
     if names := sorted(expected.keys() ^ arrays.keys()):
@@ -239,76 +199,6 @@ def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any])
     agent.seed, agent.epsilon, agent.rng = facts["seed"], epsilon, rng
     for name, variable in _variables(agent).items():
         variable.assign(arrays[name])
-
-
-def _describe_network(network: keras.Model) -> str:
-    """The kinds of its layers, and a digest of all that it is configured to be."""
-    layers = ", ".join(type(layer).__name__ for layer in network.layers)
-    return f"{layers} ({hashlib.sha256(structure(network).encode()).hexdigest()[:12]})"
-
-
-def describe(env: gym.Env | FuncEnv) -> dict[str, Any]:
-    """What makes it this environment, as far as can be seen; `render_mode` does not.
-
-    Of a registered one its id and arguments, of any other the constructor's arguments that it keeps under their names.
-    """
-    wrappers: list[Any] = []
-    if isinstance(env, FuncEnv):
-        name, arguments = f"{type(env).__name__} (functional)", vars(env)
-    else:
-        wrapper = env
-        while isinstance(wrapper, gym.Wrapper):
-            wrappers.append(type(wrapper).__name__)
-            wrapper = wrapper.env
-        if env.spec:
-            wrappers += [[w.name, _plain(w.kwargs)] for w in env.spec.additional_wrappers]
-            name, arguments = env.spec.id, {**env.spec.kwargs, "max_episode_steps": env.spec.max_episode_steps}
-        else:
-            parameters = inspect.signature(type(env.unwrapped).__init__).parameters
-            kept = vars(env.unwrapped)
-            name, arguments = type(env.unwrapped).__name__, {k: kept[k] for k in parameters if k in kept}
-    return {
-        "name": name,
-        "arguments": _plain({key: value for key, value in sorted(arguments.items()) if key != "render_mode"}),
-        "wrappers": wrappers,
-        "observation_space": str(env.observation_space),
-        "action_space": str(env.action_space),
-    }
-
-
-def _plain(value: Any) -> Any:
-    """Something that JSON holds, equal for equal values; of what has no plain value, its type."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, dict):
-        return {str(key): _plain(x) for key, x in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [_plain(x) for x in value]
-    if isinstance(value, functools.partial):
-        return [_plain(value.func), _plain(value.args), _plain(value.keywords)]
-    if tf.is_tensor(value) or isinstance(value, np.ndarray):
-        array = np.asarray(value)
-        return [str(array.dtype), list(array.shape), hashlib.sha256(array.tobytes()).hexdigest()]
-    return getattr(value, "__qualname__", type(value).__qualname__)
-
-
-def versions() -> dict[str, str]:
-    """What the last bits of a result may depend on."""
-    modules = {"tensorflow": tf, "keras": keras, "numpy": np, "gymnasium": gym}
-    versions = {name: module.__version__ for name, module in modules.items()}
-    return {"dqn_keras": __version__, "python": platform.python_version(), **versions, "processor": _processor()}
-
-
-def _processor() -> str:
-    """Its kind, with the vector instructions where the system tells them."""
-    try:
-        flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        flags = None
-    vector = sorted(x for x in flags[1].split() if x.startswith(("sse4", "avx", "fma", "amx"))) if flags else []
-    return " ".join([platform.machine(), *vector])
 
 
 @contextlib.contextmanager
@@ -351,6 +241,8 @@ def save_agent(path: str | os.PathLike, q_network: keras.Model) -> None:
             f"get_config in it, make it one ({error})"
         ) from error
     network.set_weights(q_network.get_weights())
+    finalize_layers(network)
+    check_is_equal("q_network cannot be saved", q_network, network)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         network.save(temporary)

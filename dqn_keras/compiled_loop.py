@@ -5,8 +5,9 @@ up to that update. Nothing random outlives a turn: its draws follow from the run
 """
 
 import math
+import sys
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,9 +16,10 @@ from gymnasium.experimental.functional import FuncEnv
 from dqn_keras._tensorflow import require_xla, tf
 from dqn_keras.agent import Agent, DivergedError, Episode, draws_key
 from dqn_keras.config import Config
-from dqn_keras.diagnostics import Measures, measured_step
+from dqn_keras.diagnostics import checked_step
 from dqn_keras.environment import Spaces, check_spaces
-from dqn_keras.learn import loss_values
+from dqn_keras.environments import TWINS
+from dqn_keras.learn import DEFAULT_FORMULAS, Formulas, Metrics
 from dqn_keras.networks import is_all_finite
 from dqn_keras.policy import decay_epsilon
 from dqn_keras.programs import Learner, bind
@@ -30,33 +32,27 @@ def episodes(
     agent: Agent,
     config: Config,
     episodes_per_call: int = 100,
-    loss: Callable = loss_values,
+    formulas: Formulas = DEFAULT_FORMULAS,
 ) -> Generator[Episode, None, None]:
     """Play and learn, episode after episode, until the run's last; `agent` is changed in place.
 
-    Several are played in one call of the program, up to `episodes_per_call` or about `_SECONDS_PER_CALL`, so that a
-    run can be interrupted; it returns early where the stop rule may hold, and the agent is then as that episode left
-    it. The results do not depend on the number.
+    Several are played in one call of the program, up to `episodes_per_call` (at most 100) or about `_SECONDS_PER_CALL`,
+    so that a run can be interrupted; it returns early where the stop rule may hold, and the agent is then as that
+    episode left it. The results do not depend on the number.
     """
     memory = agent.memory
     rows = tf.Variable(memory.rows)
-    num_appended = tf.Variable(memory.num_appended, dtype=tf.int32)
-    program = _bind_program(env, spaces, agent, config, episodes_per_call, loss, (rows, num_appended))
+    num_appended = tf.Variable(memory.num_appended, dtype=tf.int64)
+    program = _bind_program(env, spaces, agent, config, formulas, (rows, num_appended))
 
     at_once = 1
     while (first := len(agent.episodes)) < config.num_episodes:
         start = time.perf_counter()
         epsilons = [agent.epsilon]
-        while len(epsilons) < episodes_per_call:
+        while len(epsilons) < _CAPACITY:
             epsilons.append(decay_epsilon(epsilons[-1], config))
-        recent = np.full(config.solved_window, -np.inf)  # as if hopeless episodes had come before the first
-        rewards_before = [episode.reward for episode in agent.episodes[-config.solved_window :]]
-        recent[config.solved_window - len(rewards_before) :] = rewards_before
-        num_episodes = min(at_once, config.num_episodes - first)
-
-        numbers = draws_key(agent.seed), np.int32(first), np.int32(num_episodes)
-        arguments = (*numbers, np.array(epsilons, np.float32), recent)
-        played, *columns, fault = [x.numpy() for x in program(*map(tf.constant, arguments))]
+        numbers = _numbers(env, agent, config, epsilons, min(at_once, config.num_episodes - first))
+        played, *columns, fault = [x.numpy() for x in program(*map(tf.constant, numbers))]
         facts = _Facts(*columns)
         memory.rows[:] = rows.numpy()
         memory.num_appended = int(num_appended.numpy())
@@ -78,6 +74,39 @@ def episodes(
 
 
 _SECONDS_PER_CALL = 0.25
+_CAPACITY = 100
+"""Episodes that one call can play."""
+
+
+class _Numbers(NamedTuple):
+    """What goes into the program at each call; another value costs no compilation."""
+
+    key: Any  # int64, which all draws follow from
+    first: Any  # int32, the number of the first episode
+    num_episodes: Any  # int32
+    max_steps: Any  # int32
+    epsilons: Any  # [_CAPACITY] float32
+    recent: Any  # [solved_window] float64, the rewards of the episodes before
+    solved_reward: Any  # float64
+    gamma: Any  # float32
+    tau: Any  # float32
+
+
+def _numbers(env: FuncEnv, agent: Agent, config: Config, epsilons: list[float], num_episodes: int) -> _Numbers:
+    recent = np.full(config.solved_window, -np.inf)  # as if hopeless episodes had come before the first
+    rewards_before = [episode.reward for episode in agent.episodes[-config.solved_window :]]
+    recent[config.solved_window - len(rewards_before) :] = rewards_before
+    return _Numbers(
+        key=draws_key(agent.seed),
+        first=np.int32(len(agent.episodes)),
+        num_episodes=np.int32(num_episodes),
+        max_steps=np.int32(min(config.max_steps, getattr(env, "max_episode_steps", config.max_steps))),
+        epsilons=np.array(epsilons, np.float32),
+        recent=recent,
+        solved_reward=np.float64(config.solved_reward),
+        gamma=np.float32(config.gamma),
+        tau=np.float32(config.tau),
+    )
 
 
 def _bind_program(
@@ -85,26 +114,36 @@ def _bind_program(
     spaces: Spaces,
     agent: Agent,
     config: Config,
-    episodes_per_call: int,
-    loss: Callable,
+    formulas: Formulas,
     variables: tuple[tf.Variable, ...],
 ) -> Callable[..., list[tf.Tensor]]:
-    constants = vars(env).items()
-    is_like_its_class = all(x is None or isinstance(x, int | float | str) for _, x in constants)
-    environment = tuple(sorted(constants)) if is_like_its_class else env
-    key = ("episodes", type(env), environment, config, episodes_per_call, loss)
-    specs = (
-        tf.TensorSpec((), tf.int64),
-        tf.TensorSpec((), tf.int32),
-        tf.TensorSpec((), tf.int32),
-        tf.TensorSpec((episodes_per_call,)),
-        tf.TensorSpec((config.solved_window,), tf.float64),
+    def make_program(learner: Learner, variables: Sequence[tf.Variable]) -> Callable:
+        rows, num_appended = variables
+
+        def play(*numbers: tf.Tensor) -> tuple[tf.Tensor, ...]:
+            return _Program(env, spaces, config, formulas, learner, rows, num_appended, _Numbers(*numbers)).play()
+
+        return play
+
+    numbers = _numbers(env, agent, config, [0.0] * _CAPACITY, 0)
+    specs = [tf.TensorSpec(x.shape, x.dtype) for x in numbers]
+    is_a_twin = type(env) in TWINS.values() and vars(env) == vars(type(env)())
+    environment = (type(env), _constants(type(env))) if is_a_twin else id(env)
+    return bind(
+        make_program,
+        specs,
+        agent.learner,
+        variables,
+        key=("episodes", environment, config.steps_per_update, config.batch_size, config.memory_size, formulas.key),
+        has_own_parts=not (is_a_twin and formulas.are_the_packages),
+        jit_compile=True,
     )
 
-    def make_program(learner: Learner, variables: list[tf.Variable]) -> Callable:
-        return _Program(env, spaces, config, loss, learner, *variables).play
 
-    return bind(key, make_program, specs, agent.learner, variables, jit_compile=True)
+def _constants(cls: type) -> Hashable:
+    """The numbers of an environment of this package, which may be changed to try out another physics."""
+    named = vars(sys.modules[cls.__module__]) | vars(cls)
+    return tuple((name, x) for name, x in named.items() if isinstance(x, int | float))
 
 
 def draw_bits(num: int, key: tf.Tensor, counter: Any) -> tf.Tensor:
@@ -174,31 +213,30 @@ class _Facts(NamedTuple):
 
 
 class _Program:
-    """The program itself, for one environment and configuration; it is traced once, and runs for any agent."""
+    """The program itself, as it is traced."""
 
     def __init__(
         self,
         env: FuncEnv,
         spaces: Spaces,
         config: Config,
-        loss: Callable,
+        formulas: Formulas,
         learner: Learner,
         rows: tf.Variable,
         num_appended: tf.Variable,
+        numbers: _Numbers,
     ) -> None:
-        self._env, self._spaces, self._config, self._loss, self._learner = env, spaces, config, loss, learner
-        self._rows, self._num_appended = rows, num_appended
-        self._max_steps = min(config.max_steps, getattr(env, "max_episode_steps", config.max_steps))
+        self._env, self._spaces, self._config, self._formulas, self._learner = env, spaces, config, formulas, learner
+        self._rows, self._num_appended, self._numbers = rows, num_appended, numbers
 
-    def play(
-        self, key: tf.Tensor, first: tf.Tensor, num_episodes: tf.Tensor, epsilons: tf.Tensor, recent: tf.Tensor
-    ) -> tuple[tf.Tensor, ...]:
+    def play(self) -> tuple[tf.Tensor, ...]:
         """The program: -> episodes played, the _Facts of each, the fault."""
-        capacity, window = epsilons.shape[0], recent.shape[0]
+        key, first, num_episodes, _, epsilons, recent, solved_reward, *_ = self._numbers
+        window = recent.shape[0]
 
         def is_to_go_on(i: tf.Tensor, facts: _Facts, fault: tf.Tensor) -> tf.Tensor:
             # A little below the bound, so that `train`, which decides, is asked wherever rounding could matter.
-            may_be_solved = tf.reduce_mean(facts.reward[i : i + window]) > self._config.solved_reward - 1e-6
+            may_be_solved = tf.reduce_mean(facts.reward[i : i + window]) > solved_reward - 1e-6
             return (i < num_episodes) & (fault == 0) & ~((i > 0) & may_be_solved)
 
         def play_one(i: tf.Tensor, facts: _Facts, _: tf.Tensor) -> tuple[tf.Tensor, _Facts, tf.Tensor]:
@@ -207,9 +245,9 @@ class _Program:
             parts = zip(facts, places, new, strict=True)
             return i + 1, _Facts(*(tf.tensor_scatter_nd_update(x, [[k]], [y]) for x, k, y in parts)), fault
 
-        integers, floats = tf.zeros([capacity], tf.int32), tf.zeros([capacity])
-        rewards = tf.concat([recent, tf.zeros([capacity], tf.float64)], axis=0)
-        facts = _Facts(rewards, integers, tf.zeros([capacity, 3]), floats, floats, integers, integers > 0)
+        integers, floats = tf.zeros([_CAPACITY], tf.int32), tf.zeros([_CAPACITY])
+        rewards = tf.concat([recent, tf.zeros([_CAPACITY], tf.float64)], axis=0)
+        facts = _Facts(rewards, integers, tf.zeros([_CAPACITY, 3]), floats, floats, integers, integers > 0)
         played, facts, fault = tf.while_loop(is_to_go_on, play_one, (tf.constant(0), facts, tf.constant(0)))
         return played, *facts._replace(reward=facts.reward[window:]), fault
 
@@ -227,7 +265,7 @@ class _Program:
                 j = (t + n - 1) % n
                 rng = tf.stack([key, -1 - tf.cast(t, tf.int64)])
                 state, new_reward, terminated, fault = self._step(state, epsilon, bits[j], bits[n + j], rng)
-                is_over = terminated | (t + 1 >= self._max_steps) | (fault > 0)
+                is_over = terminated | (t + 1 >= self._numbers.max_steps) | (fault > 0)
                 reward, most = reward + tf.cast(new_reward, tf.float64), tf.maximum(most, new_reward)
                 return state, is_over, reward, most, t + 1, t % n == 0, terminated, fault
 
@@ -239,7 +277,7 @@ class _Program:
             )
 
             is_update &= (fault == 0) & (self._num_appended >= batch_size)
-            size = tf.minimum(self._num_appended, memory_size)
+            size = tf.cast(tf.minimum(self._num_appended, memory_size), tf.int32)
             loss, mean_q, max_q, td_error = tf.cond(
                 is_update,
                 lambda: self._update(sample_indices(bits[2 * n :], key, number, size)),
@@ -291,12 +329,12 @@ class _Program:
     def _observation(self, state: Any, rng: tf.Tensor) -> tf.Tensor:
         return tf.cast(self._env.observation(state, rng), self._spaces.state_dtype)
 
-    def _update(self, indices: tf.Tensor) -> Measures:
+    def _update(self, indices: tf.Tensor) -> Metrics:
         batch = unpack(tf.gather(self._rows, indices), self._spaces.state_shape)
-        return measured_step(batch, self._learner, self._config, self._loss)
+        return checked_step(batch, self._learner, self._numbers.gamma, self._numbers.tau, self._formulas)
 
 
-_NO_UPDATE = Measures(loss=0.0, mean_q=0.0, max_q=-math.inf, td_error=0.0)
+_NO_UPDATE = Metrics(loss=0.0, mean_q=0.0, max_q=-math.inf, td_error=0.0)
 
 
 def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:

@@ -2,47 +2,32 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from dqn_keras._tensorflow import tf
 from dqn_keras.agent import Episode
 from dqn_keras.config import Config
-from dqn_keras.learn import gradient_step, td_errors
+from dqn_keras.learn import Formulas, Metrics, gradient_step
 from dqn_keras.networks import is_all_finite
 from dqn_keras.programs import Learner
 from dqn_keras.replay import Experience
 
 
-class Measures(NamedTuple):
-    """Of one update's batch, before the update; float32 scalars."""
-
-    loss: Any
-    """NaN also if the update has left a weight that is not finite."""
-    mean_q: Any
-    """Mean over the batch of max_a Q(s, a), the metric of Mnih et al. 2013."""
-    max_q: Any
-    """The highest of them."""
-    td_error: Any
-    """Mean of |y - Q(s, a)|."""
+def checked_step(experiences: Experience, learner: Learner, gamma: Any, tau: Any, formulas: Formulas) -> Metrics:
+    """`gradient_step`, its loss NaN if the update has left a weight that is not finite."""
+    metrics = gradient_step(experiences, gamma, *learner, tau, formulas)
+    loss = tf.where(is_all_finite(*learner.q_network.weights), metrics.loss, math.nan)
+    return metrics._replace(loss=loss)
 
 
-def measured_step(batch: Experience, learner: Learner, config: Config, loss: Callable) -> Measures:
-    """`gradient_step`, and what it was like. XLA finds that both ask for the same values, and computes them once."""
-    q = tf.reduce_max(learner.q_network(batch.state), axis=-1)  # [B]
-    errors = td_errors(batch, config.gamma, learner.q_network, learner.q_hat_network)  # [B]
-    value = gradient_step(batch, config.gamma, *learner, config.tau, loss)
-    value = tf.where(is_all_finite(*learner.q_network.weights), value, math.nan)
-    return Measures(value, tf.reduce_mean(q), tf.reduce_max(q), tf.reduce_mean(tf.abs(errors)))
-
-
-def sum_up(measures: Sequence[Measures]) -> Measures:
+def sum_up(metrics: Sequence[Metrics]) -> Metrics:
     """Of an episode's updates: the means, and the highest max_q; NaN if there are none."""
-    if not measures:
-        return Measures(*[math.nan] * len(Measures._fields))
-    loss, mean_q, max_q, td_error = zip(*measures, strict=True)
-    n = len(measures)
-    return Measures(sum(loss) / n, sum(mean_q) / n, max(max_q), sum(td_error) / n)
+    if not metrics:
+        return Metrics(*[math.nan] * len(Metrics._fields))
+    loss, mean_q, max_q, td_error = zip(*metrics, strict=True)
+    n = len(metrics)
+    return Metrics(sum(loss) / n, sum(mean_q) / n, max(max_q), sum(td_error) / n)
 
 
 class Logged(NamedTuple):

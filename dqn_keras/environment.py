@@ -89,6 +89,16 @@ class Spaces(NamedTuple):
     """What the environment calls the action of index 0."""
 
 
+def some_states(space: Any, dtype: np.dtype, num_states: int = 8) -> np.ndarray:
+    """States within the bounds of a space to try a network on, [num_states, *S]; always the same."""
+    rng = np.random.default_rng(0)
+    normal, uniform = rng.normal(size=(num_states, *space.shape)), rng.random((num_states, *space.shape))
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    is_bounded = (low > -1e6) & (high < 1e6)  # a space without bounds may say so by a huge number
+    within = np.where(is_bounded, low, 0) + np.where(is_bounded, high - low, 0) * uniform
+    return np.where(is_bounded, within, np.clip(normal, low, high)).astype(dtype)
+
+
 def check_spaces(name: str, observations: gym.Space, actions: gym.Space) -> Spaces:
     """The sizes of the two spaces; ValueError if they are not supported."""
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:

@@ -14,9 +14,9 @@ import numpy as np
 from dqn_keras._tensorflow import tf
 from dqn_keras.agent import Agent, DivergedError, Episode, episode_seed
 from dqn_keras.config import Config
-from dqn_keras.diagnostics import Measures, measured_step, sum_up
+from dqn_keras.diagnostics import checked_step, sum_up
 from dqn_keras.environment import CheckedEnv
-from dqn_keras.learn import loss_values
+from dqn_keras.learn import DEFAULT_FORMULAS, Formulas, Metrics
 from dqn_keras.networks import is_relu_mlp, q_values
 from dqn_keras.policy import action, decay_epsilon
 from dqn_keras.programs import Learner, bind
@@ -24,10 +24,11 @@ from dqn_keras.replay import Experience, unpack
 
 
 def episodes(
-    env: CheckedEnv, agent: Agent, config: Config, loss: Callable = loss_values
+    env: CheckedEnv, agent: Agent, config: Config, formulas: Formulas = DEFAULT_FORMULAS
 ) -> Generator[Episode, None, None]:
     """Play and learn, episode after episode, until the run's last; `agent` is changed in place."""
-    q = _InNumPy(agent, config, loss) if is_relu_mlp(agent.q_network) else _InTensorFlow(agent, config, loss)
+    kind = _InNumPy if is_relu_mlp(agent.q_network) else _InTensorFlow
+    q = kind(agent, config, formulas)
     while len(agent.episodes) < config.num_episodes:
         agent.episodes.append(_play_episode(env, agent, config, q))
         yield agent.episodes[-1]
@@ -35,7 +36,7 @@ def episodes(
 
 def _play_episode(env: CheckedEnv, agent: Agent, config: Config, q: "_InNumPy | _InTensorFlow") -> Episode:
     number, epsilon, memory, rng = len(agent.episodes), agent.epsilon, agent.memory, agent.rng
-    total_reward, max_reward, measures, t, terminated = 0.0, -math.inf, [], 0, False
+    total_reward, max_reward, metrics, t, terminated = 0.0, -math.inf, [], 0, False
     q.read_weights()
 
     state = env.reset(episode_seed(agent.seed, number), number)
@@ -47,8 +48,8 @@ def _play_episode(env: CheckedEnv, agent: Agent, config: Config, q: "_InNumPy | 
         max_reward = max(max_reward, reward)
 
         if t % config.steps_per_update == 0 and len(memory) >= config.batch_size:
-            measures.append(q.update(memory.sample_rows(config.batch_size, rng)))
-            if not math.isfinite(measures[-1].loss):
+            metrics.append(q.update(memory.sample_rows(config.batch_size, rng)))
+            if not math.isfinite(metrics[-1].loss):
                 raise DivergedError(
                     f"the loss or a weight is not finite in episode {number}, step {t}: learning has diverged"
                 )
@@ -57,21 +58,21 @@ def _play_episode(env: CheckedEnv, agent: Agent, config: Config, q: "_InNumPy | 
         if terminated or truncated:
             break
 
-    agent.num_updates += len(measures)
+    agent.num_updates += len(metrics)
     agent.epsilon = decay_epsilon(epsilon, config)
-    loss, mean_q, max_q, td_error = sum_up(measures)
+    loss, mean_q, max_q, td_error = sum_up(metrics)
     return Episode(number, total_reward, t + 1, epsilon, loss, mean_q, max_q, td_error, max_reward, terminated)
 
 
 class _InNumPy:
     """Q, computed in NumPy with the weights that the last update has given back."""
 
-    def __init__(self, agent: Agent, config: Config, loss: Callable) -> None:
+    def __init__(self, agent: Agent, config: Config, formulas: Formulas) -> None:
         self._network = agent.q_network
         self._shapes = [tuple(w.shape) for w in agent.q_network.weights]
-        num_measures = len(Measures._fields)
-        self._ends = np.cumsum([num_measures] + [math.prod(shape) for shape in self._shapes]).tolist()
-        self._step = _bind_step(agent, config, loss, gives_weights=True)
+        num_metrics = len(Metrics._fields)
+        self._ends = np.cumsum([num_metrics] + [math.prod(shape) for shape in self._shapes]).tolist()
+        self._step = _bind_step(agent, config, formulas, gives_weights=True)
 
     def read_weights(self) -> None:
         """Anew at each episode: a callback may have changed them."""
@@ -81,52 +82,64 @@ class _InNumPy:
         """Q(s, .), [A]."""
         return q_values(self._weights, state)
 
-    def update(self, rows: np.ndarray) -> Measures:
+    def update(self, rows: np.ndarray) -> Metrics:
         """A gradient step on rows of the memory."""
         flat = self._step(tf.constant(rows))[0].numpy()
         parts = zip(self._ends, self._ends[1:], self._shapes, strict=False)
         self._weights = [flat[i:j].reshape(shape) for i, j, shape in parts]
-        return Measures(*flat[: self._ends[0]].tolist())
+        return Metrics(*flat[: self._ends[0]].tolist())
 
 
 class _InTensorFlow:
     """The same for any other network, a TensorFlow call per step."""
 
-    def __init__(self, agent: Agent, config: Config, loss: Callable) -> None:
+    def __init__(self, agent: Agent, config: Config, formulas: Formulas) -> None:
         def make_values(learner: Learner, _: Any) -> Callable[[tf.Tensor], tf.Tensor]:
             return lambda state: learner.q_network(state[None])[0]
 
         state = tf.TensorSpec(agent.memory.state_shape, agent.memory.rows.dtype)
-        self._values = bind("values", make_values, [state], agent.learner, jit_compile=config.jit_compile)
-        self._step = _bind_step(agent, config, loss, gives_weights=False)
+        jit = config.jit_compile
+        self._values = bind(make_values, [state], agent.learner, key="values", has_own_parts=False, jit_compile=jit)
+        self._step = _bind_step(agent, config, formulas, gives_weights=False)
 
     def read_weights(self) -> None:
-        """They are where they are."""
+        """They are in the network."""
 
     def values(self, state: np.ndarray) -> np.ndarray:
         """Q(s, .), [A]."""
         return self._values(tf.constant(state))[0].numpy()
 
-    def update(self, rows: np.ndarray) -> Measures:
+    def update(self, rows: np.ndarray) -> Metrics:
         """A gradient step on rows of the memory."""
-        return Measures(*self._step(tf.constant(rows))[0].numpy().tolist())
+        return Metrics(*self._step(tf.constant(rows))[0].numpy().tolist())
 
 
-def _bind_step(agent: Agent, config: Config, loss: Callable, gives_weights: bool) -> Callable[..., list[tf.Tensor]]:
-    """The gradient step on rows of the memory -> its measures and, if asked for, Q's new weights, all in one vector.
+def _bind_step(
+    agent: Agent, config: Config, formulas: Formulas, gives_weights: bool
+) -> Callable[[tf.Tensor], list[tf.Tensor]]:
+    """The gradient step on rows of the memory -> its metrics and, if asked for, Q's new weights, all in one vector.
 
-    One array goes in and one comes out: each further one costs as much as its share of the arithmetic.
+    One array comes out and two go in: each further one costs as much as its share of the arithmetic.
     """
     rows, state_shape = agent.memory.rows, agent.memory.state_shape
 
-    def make_step(learner: Learner, _: Any) -> Callable[[tf.Tensor], tf.Tensor]:
-        def step(rows: tf.Tensor) -> tf.Tensor:
-            measures = measured_step(unpack(rows, state_shape), learner, config, loss)
+    def make_step(learner: Learner, _: Any) -> Callable[..., tf.Tensor]:
+        def step(rows: tf.Tensor, numbers: tf.Tensor) -> tf.Tensor:
+            gamma, tau = tf.unstack(numbers)
+            metrics = checked_step(unpack(rows, state_shape), learner, gamma, tau, formulas)
             weights = learner.q_network.weights if gives_weights else ()
-            return tf.concat([tf.stack(measures), *(tf.reshape(w, [-1]) for w in weights)], axis=0)
+            return tf.concat([tf.stack(metrics), *(tf.reshape(w, [-1]) for w in weights)], axis=0)
 
         return step
 
-    specs = [tf.TensorSpec((config.batch_size, rows.shape[1]), rows.dtype)]
-    key = ("update", config.gamma, config.tau, state_shape, loss, gives_weights)
-    return bind(key, make_step, specs, agent.learner, jit_compile=config.jit_compile)
+    specs = [tf.TensorSpec((config.batch_size, rows.shape[1]), rows.dtype), tf.TensorSpec((2,))]
+    step = bind(
+        make_step,
+        specs,
+        agent.learner,
+        key=("update", formulas.key, gives_weights),
+        has_own_parts=not formulas.are_the_packages,
+        jit_compile=config.jit_compile,
+    )
+    numbers = tf.constant([config.gamma, config.tau], tf.float32)
+    return lambda rows: step(rows, numbers)

@@ -1,9 +1,13 @@
 """The two networks: Q, which learns, and Q-hat, its slow copy that the targets are computed from."""
 
 import contextlib
+import inspect
 import json
 import random
+import warnings
+import weakref
 from collections.abc import Callable, Iterator, Sequence
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -31,7 +35,9 @@ def make_q_network(
     for i, (units, initializer) in enumerate(zip(hidden_units, hidden, strict=True), start=1):
         layers.append(_dense(units, "relu", initializer, f"hidden_{i}"))
     layers.append(_dense(num_actions, "linear", output, "q_values"))
-    return keras.Sequential(layers, name=name)
+    network = keras.Sequential(layers, name=name)
+    _made_here.add(network)
+    return network
 
 
 def _dense(units: int, activation: str, initializer: keras.initializers.Initializer, name: str) -> keras.layers.Dense:
@@ -67,7 +73,7 @@ def make_networks(
 
 @contextlib.contextmanager
 def python_random_kept() -> Iterator[None]:
-    """Leave Python's global random state as it is: Keras draws from there for initializers without a seed."""
+    """Leaves Python's global random state as it is: Keras draws from it for initializers without a seed."""
     state = random.getstate()
     try:
         yield
@@ -75,10 +81,131 @@ def python_random_kept() -> Iterator[None]:
         random.setstate(state)
 
 
-def clone(network: keras.Model, clone_layer: Callable[[keras.Layer], keras.Layer] | None = None) -> keras.Model:
-    """A network of the same configuration, its weights its own."""
+_made_here: weakref.WeakSet[keras.Model] = weakref.WeakSet()
+
+
+def units_if_made_here(network: keras.Model) -> tuple[int, ...] | None:
+    """The sizes of all layers, states to actions, of a network that `make_q_network` made and nobody has altered.
+
+    None for any other network, and where a layer was given another activation, a regularizer, a constraint or a method
+    of its own, or was frozen.
+    """
+    if network not in _made_here or not is_relu_mlp(network):
+        return None
+    for layer in network.layers:
+        added = (layer.kernel_regularizer, layer.bias_regularizer, layer.activity_regularizer)
+        if any(added) or layer.kernel_constraint or layer.bias_constraint or not layer.trainable:
+            return None
+    return (network.input_shape[-1], *(layer.units for layer in network.layers))
+
+
+def all_layers(network: keras.Model) -> list[keras.layers.Layer]:
+    """The layers of the network, those in nested models and in wrappers included."""
+    return network._flatten_layers(include_self=False)
+
+
+def copy(network: keras.Model, states: np.ndarray | None = None) -> keras.Model:
+    """A second network that computes what the first does, with weights of its own.
+
+    Keras copies what a layer's configuration says. What was set on a layer later, such as the mean that
+    `Normalization.adapt` finds, is carried over, and the outputs for `states` [B, *S] are compared.
+
+    Raises:
+        ValueError: a layer cannot be copied, or its copy computes something else; the message names the layer.
+    """
     with python_random_kept():
-        return keras.models.clone_model(network, clone_function=clone_layer)
+        second = keras.models.clone_model(network, clone_function=_copy_layer, recursive=True)
+    second.set_weights(network.get_weights())
+    finalize_layers(second)
+    for layer, copied in zip(all_layers(network), all_layers(second), strict=False):
+        _carry_attributes(layer, copied)
+    check_is_equal("q_network cannot be copied for Q-hat", network, second, states)
+    return second
+
+
+def finalize_layers(network: keras.Model) -> None:
+    """Lets layers that keep something beside their weights, as Normalization does, find it from the weights."""
+    for layer in all_layers(network):
+        if hasattr(layer, "finalize_state"):
+            layer.finalize_state()
+
+
+def _copy_layer(layer: keras.layers.Layer) -> keras.layers.Layer:
+    try:
+        if type(layer) is keras.layers.Lambda:  # from_config wants code from a file to be trusted; this is none
+            config = {key: x for key, x in layer.get_config().items() if key in ("name", "trainable", "dtype")}
+            output_shape = layer._output_shape
+            return keras.layers.Lambda(layer.function, output_shape, layer.mask, layer.arguments, **config)
+        return type(layer).from_config(layer.get_config())
+    except Exception as error:  # whatever a layer's own code says
+        raise ValueError(
+            f"q_network cannot be copied for Q-hat: layer {layer.name!r} ({type(layer).__name__}) needs a get_config() "
+            f"that returns what its __init__ takes ({error})"
+        ) from error
+
+
+def _carry_attributes(layer: keras.layers.Layer, copied: keras.layers.Layer) -> None:
+    """What a configuration does not hold: numbers, arrays and functions that were set on the layer."""
+    for name, value in vars(layer).items():
+        is_plain = value is None or isinstance(value, bool | int | float | str | np.ndarray | np.generic | FunctionType)
+        is_an_array = tf.is_tensor(value) and hasattr(value, "numpy")
+        is_its_own = name.lstrip("_") in ("name", "path", "build", "quantize", "auto_name")
+        if (is_plain or is_an_array) and not is_its_own:
+            vars(copied)[name] = value
+
+
+def check_is_equal(problem: str, network: keras.Model, second: keras.Model, states: np.ndarray | None = None) -> None:
+    """ValueError that begins with `problem` if the two networks give other values for `states` (by default random)."""
+    if states is None:
+        states = np.random.default_rng(0).normal(size=(8, *network.input_shape[1:])).astype(np.float32)
+    try:
+        outputs, again = network(states), network(states)
+    except tf.errors.OpError:  # numbers that it does not take, as an Embedding takes no negative ones
+        states = np.zeros_like(states)
+        outputs, again = network(states), network(states)
+    if not np.array_equal(outputs, again, equal_nan=True):
+        return  # it is random, so that no copy can be told from it
+    if np.allclose(outputs, second(states), rtol=1e-4, atol=1e-5, equal_nan=True):
+        return
+    name, kind = _first_difference(network, second, states)
+    raise ValueError(
+        f"{problem}: the copy of layer {name!r} ({kind}) computes something else; its get_config() must hold all that "
+        "it computes with"
+    )
+
+
+def _first_difference(network: keras.Model, second: keras.Model, states: np.ndarray) -> tuple[str, str]:
+    """Name and class of the first layer whose outputs differ."""
+    for layer, copied in zip(network.layers, second.layers, strict=True):
+        try:
+            values = [
+                keras.tree.flatten(keras.Model(n.inputs, x.output)(states))
+                for n, x in ((network, layer), (second, copied))
+            ]
+        except (AttributeError, ValueError):  # a layer that is used twice has no one output
+            continue
+        if not all(np.allclose(a, b, rtol=1e-4, atol=1e-5, equal_nan=True) for a, b in zip(*values, strict=True)):
+            return layer.name, type(layer).__name__
+    return network.name, type(network).__name__
+
+
+def warn_of_inference_mode(network: keras.Model) -> None:
+    """Warns of layers that would do something else in training: a Q-network is always called in inference mode."""
+    if names := [f"{x.name} ({type(x).__name__})" for x in all_layers(network) if _differs_in_training(x)]:
+        warnings.warn(
+            f"q_network is called in inference mode, also while it learns: {', '.join(names)} will not do there what "
+            "model.fit would have it do",
+            stacklevel=4,
+        )
+
+
+def _differs_in_training(layer: keras.layers.Layer) -> bool:
+    if isinstance(layer, keras.layers.BatchNormalization | keras.layers.SpectralNormalization):
+        return True
+    if not type(layer).__module__.startswith("keras."):
+        return "training" in inspect.signature(type(layer).call).parameters
+    rates = (getattr(layer, name, 0) for name in ("rate", "stddev", "dropout", "recurrent_dropout", "_dropout"))
+    return any(isinstance(rate, int | float) and rate > 0 for rate in rates)
 
 
 def structure(network: keras.Model) -> str:
@@ -107,13 +234,6 @@ def _numbered(reference: Any, numbers: dict[str, int]) -> Any:
     if isinstance(reference, list | tuple):
         return [_numbered(x, numbers) for x in reference]
     return numbers.get(reference, reference) if isinstance(reference, str) else reference
-
-
-def copy(network: keras.Model) -> keras.Model:
-    """A second network, equal to the first."""
-    second = clone(network)
-    second.set_weights(network.get_weights())
-    return second
 
 
 def q_values(weights: Sequence[np.ndarray], state: np.ndarray) -> np.ndarray:
@@ -148,10 +268,11 @@ def q_function(q_network: keras.Model) -> Callable[[np.ndarray], np.ndarray]:
 
 def is_relu_mlp(q_network: keras.Model) -> bool:
     """Whether `q_values` computes this network: dense layers, ReLU but for a linear last one."""
-    if not isinstance(q_network, keras.Sequential):
+    if type(q_network) is not keras.Sequential or "call" in vars(q_network):
         return False
     if not all(
-        type(x) is keras.layers.Dense and len(x.weights) == 2 and x.compute_dtype == "float32" for x in q_network.layers
+        type(x) is keras.layers.Dense and len(x.weights) == 2 and x.compute_dtype == "float32" and "call" not in vars(x)
+        for x in q_network.layers
     ):
         return False
     *hidden, output = [layer.activation for layer in q_network.layers]
@@ -159,11 +280,19 @@ def is_relu_mlp(q_network: keras.Model) -> bool:
 
 
 def check_network(name: str, network: keras.Model) -> None:
-    """TypeError or ValueError if it is not a Sequential or functional model that has been built."""
+    """TypeError or ValueError if it is no built Sequential or functional model, states [B, *S] -> Q-values [B, A]."""
     if not isinstance(network, keras.Sequential | keras.models.Model):
         raise TypeError(f"{name} must be a Keras model, got {network!r}")
     if not network.built or not hasattr(network, "input_shape"):
         raise ValueError(f"{name} must be a Sequential or functional model with an Input layer")
+    for kind, tensors in ("input", network.inputs), ("output", network.outputs):
+        if len(tensors) != 1:
+            raise ValueError(f"{name} must have one {kind}, got {len(tensors)}")
+    shape, dtype = network.output_shape, network.outputs[0].dtype
+    if not isinstance(shape, tuple) or len(shape) != 2 or shape[1] is None:
+        raise ValueError(f"{name} must give Q-values of shape [B, A], got output {shape}")
+    if dtype != "float32":
+        raise ValueError(f"{name} must give float32 values, got {dtype}")
 
 
 def check_fits(q_network: keras.Model, state_shape: tuple[int, ...], num_actions: int) -> None:
@@ -176,8 +305,6 @@ def check_fits(q_network: keras.Model, state_shape: tuple[int, ...], num_actions
             f"q_network must map states of shape {state_shape} to {num_actions} actions, "
             f"got input {_without_batch(takes)} and output {_without_batch(gives)}"
         )
-    if (dtype := q_network.outputs[0].dtype) != "float32":
-        raise ValueError(f"q_network must give float32 values, got {dtype}")
     if not all(np.isfinite(w).all() for w in q_network.get_weights()):
         raise ValueError("q_network must have finite weights, got NaN or infinity among them")
 

@@ -1,18 +1,18 @@
-"""Compiled programs, shared by all agents of one shape.
+"""Compiled programs: those of the package's own networks are shared, everything else is traced as it is.
 
 TensorFlow traces and XLA compiles a function for the very variables that it names, and neither is ever freed: a second
-agent would cost a second of compilation and megabytes that stay. So a program is traced on a *template*, networks
-and optimizer of the same configuration, and then called with the variables of any agent like it in their place.
+agent would cost seconds of compilation and megabytes that stay. So a program for networks that the package made, which
+it knows all of, is traced on a *stand-in* of the same sizes, and then called with any agent's variables in their place.
+A network or optimizer of the user's is never rebuilt: its program is traced on the objects themselves.
 """
 
-import json
-from collections.abc import Callable, Hashable, Sequence
-from numbers import Real
-from types import FunctionType
+import contextlib
+import re
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from dqn_keras._tensorflow import keras, require_xla, tf
-from dqn_keras.networks import clone, structure
+from dqn_keras.networks import make_q_network, units_if_made_here
 
 
 class Learner(NamedTuple):
@@ -24,11 +24,11 @@ class Learner(NamedTuple):
 
     @property
     def variables(self) -> list[keras.Variable]:
-        """All that they hold, in an order that their configuration fixes."""
+        """All that they hold, in an order that follows from how they were made."""
         return [*self.q_network.variables, *self.q_hat_network.variables, *self.optimizer.variables]
 
     def prepare(self) -> None:
-        """Check that the networks belong together, and build the optimizer."""
+        """Checks that the three belong together, and builds the optimizer."""
         q_network, q_hat_network, optimizer = self
         if not isinstance(optimizer, keras.Optimizer):
             raise TypeError(f"optimizer must be a Keras optimizer, got {optimizer!r}")
@@ -37,44 +37,68 @@ class Learner(NamedTuple):
         shapes, hat_shapes = ([tuple(w.shape) for w in n.weights] for n in (q_network, q_hat_network))
         if shapes != hat_shapes:
             raise ValueError(f"q_hat_network must have weights of q_network's shapes {shapes}, got {hat_shapes}")
+        if not q_network.trainable_variables:
+            raise ValueError("q_network must have weights that can be trained, got none")
         if not optimizer.built:
             optimizer.build(q_network.trainable_variables)
-        optimizer._check_variables_are_known(q_network.trainable_variables)  # else ValueError, in Keras' words
+        try:
+            optimizer._check_variables_are_known(q_network.trainable_variables)
+        except ValueError:
+            raise ValueError(
+                f"optimizer must be a new one, or one that was built for this q_network; {optimizer.name!r} was built "
+                "for other variables"
+            ) from None
 
-    def template(self, jit_compile: bool) -> "Learner":
-        """New ones of the same configuration, with variables of their own."""
-        clone_layer = _clone_for_xla if jit_compile else None
-        q_network, q_hat_network = (clone(network, clone_layer) for network in self[:2])
-        optimizer = type(self.optimizer).from_config(self.optimizer.get_config())
-        optimizer.build(q_network.trainable_variables)
-        return Learner(q_network, q_hat_network, optimizer)
-
-    def configuration(self) -> Hashable:
-        """Equal for two learners that one program can serve. Weights and the learning rate are not part of it."""
-        optimizer_config = self.optimizer.get_config()
-        if isinstance(optimizer_config.get("learning_rate"), Real):
-            del optimizer_config["learning_rate"]  # a variable
-        del optimizer_config["name"]
-        variables = [(tuple(v.shape), v.dtype, v.trainable) for v in self.variables]
-        networks = self.q_network, self.q_hat_network
-        return (
-            *map(structure, networks),
-            *(_code(layer) for network in networks for layer in network._flatten_layers(include_self=False)),
-            type(self.optimizer),
-            json.dumps(optimizer_config, sort_keys=True, default=repr),
-            tuple(variables),
-        )
+    def sizes(self) -> tuple[int, ...] | None:
+        """The sizes of the networks if the package made them and Adam is as Keras makes it; else None."""
+        units = units_if_made_here(self.q_network)
+        if units is None or units != units_if_made_here(self.q_hat_network):
+            return None
+        return units if _is_plain_adam(self.optimizer, self.q_network.trainable_variables) else None
 
 
-def _code(layer: keras.layers.Layer) -> Hashable:
-    """A class or function of the reader's own may be defined anew under its name, as in a cell that is run again."""
-    activation = getattr(layer, "activation", None)
-    return type(layer), activation if isinstance(activation, FunctionType) else None
+def _is_plain_adam(optimizer: keras.Optimizer, variables: Sequence[keras.Variable]) -> bool:
+    """Whether it is an Adam of which nothing but the learning rate was chosen, built for these variables."""
+    if type(optimizer) is not keras.optimizers.Adam or not isinstance(optimizer._learning_rate, keras.Variable):
+        return False
+    built_for = optimizer._trainable_variables
+    return (
+        all(getattr(optimizer, name) == value for name, value in _PLAIN_ADAM.items())
+        and not vars(optimizer).keys() & {"apply", "apply_gradients", "scale_loss", "update_step"}
+        and len(built_for) == len(variables)
+        and all(a is b for a, b in zip(built_for, variables, strict=True))
+    )
 
 
-def _clone_for_xla(layer: keras.layers.Layer) -> keras.layers.Layer:
-    is_narrow = type(layer) is keras.layers.Dense and 1 < layer.units <= 4 and layer.compute_dtype == "float32"
-    return (_NarrowDense if is_narrow else type(layer)).from_config(layer.get_config())
+_PLAIN_ADAM = {
+    "beta_1": 0.9,
+    "beta_2": 0.999,
+    "epsilon": 1e-7,
+    "amsgrad": False,
+    "weight_decay": None,
+    "clipnorm": None,
+    "clipvalue": None,
+    "global_clipnorm": None,
+    "use_ema": False,
+    "loss_scale_factor": None,
+    "gradient_accumulation_steps": None,
+}
+
+
+def _stand_in(units: Sequence[int], jit_compile: bool) -> Learner:
+    """Networks of these sizes, states to actions, and their Adam, with variables of their own."""
+    num_features, *hidden_units, num_actions = units
+
+    def make() -> keras.Sequential:
+        network = make_q_network(num_features, num_actions, hidden_units, seed=0)
+        if not (jit_compile and 1 < num_actions <= 4):
+            return network
+        output = _NarrowDense.from_config(network.layers[-1].get_config())
+        return keras.Sequential([keras.Input((num_features,)), *network.layers[:-1], output])
+
+    learner = Learner(make(), make(), keras.optimizers.Adam())
+    learner.prepare()
+    return learner
 
 
 class _NarrowDense(keras.layers.Dense):
@@ -85,12 +109,7 @@ class _NarrowDense(keras.layers.Dense):
     """
 
     def call(self, inputs: tf.Tensor, training: bool | None = None) -> tf.Tensor:
-        if len(inputs.shape) != 2 or inputs.dtype != self.compute_dtype:
-            return super().call(inputs, training)
-        outputs = _narrow_product(tf.convert_to_tensor(inputs), tf.convert_to_tensor(self.kernel))
-        if self.use_bias:
-            outputs += self.bias
-        return outputs if self.activation is None else self.activation(outputs)
+        return _narrow_product(tf.convert_to_tensor(inputs), tf.convert_to_tensor(self.kernel)) + self.bias
 
 
 @tf.custom_gradient
@@ -108,49 +127,91 @@ def _narrow_product(x: tf.Tensor, kernel: tf.Tensor) -> tuple[tf.Tensor, Callabl
 class _Program(NamedTuple):
     function: Any
     captured: list[int | tf.Tensor]
-    """What the function takes beside its arguments: the number of a variable, or a constant."""
+    """What the function takes beside its arguments: the number of one of the stand-in's variables, or a constant."""
     kept_alive: Any
 
 
-_programs: dict[Hashable, _Program] = {}
+_shared: dict[Hashable, _Program] = {}
+_of_this_study: dict[Hashable, _Program] | None = None
+
+
+@contextlib.contextmanager
+def shared_in(programs: dict) -> Iterator[None]:
+    """Within, programs with parts of the user's are kept in `programs`, for runs that differ in the seed alone."""
+    global _of_this_study
+    before, _of_this_study = _of_this_study, programs
+    try:
+        yield
+    finally:
+        _of_this_study = before
 
 
 def bind(
-    key: Hashable,
-    make_function: Callable[[Learner, list[tf.Variable]], Callable],
+    make_function: Callable[[Learner, Sequence[tf.Variable]], Callable],
     specs: Sequence[tf.TensorSpec],
     learner: Learner,
     variables: Sequence[tf.Variable] = (),
     *,
+    key: Hashable,
+    has_own_parts: bool,
     jit_compile: bool,
 ) -> Callable[..., list[tf.Tensor]]:
     """A compiled function of tensors that reads and changes `learner` and `variables`: tensors -> flat outputs.
 
     Args:
-        key: tells apart the functions that `make_function` can make for one configuration of the learner.
-        make_function: the template and its extra variables -> a function of tensors as in `specs`.
+        make_function: a learner and further variables -> a function of tensors as in `specs`.
         specs: of the arguments.
         learner: the agent's own.
         variables: further tf.Variables that the function changes.
+        key: tells apart the functions that `make_function` can make for learners of one size.
+        has_own_parts: whether the function calls something of the user's beside the learner; then it is traced again
+            at each call, except in a study.
         jit_compile: by XLA.
     """
-    key = (key, learner.configuration(), tuple(specs), jit_compile)
-    if key not in _programs:
-        if jit_compile:
-            require_xla()
-        template, extra = learner.template(jit_compile), [tf.Variable(tf.zeros_like(v)) for v in variables]
-        if [v.shape for v in template.variables] != [v.shape for v in learner.variables]:
-            raise ValueError("optimizer must be built for q_network's trainable variables, all of them and no other")
-        function = tf.function(make_function(template, extra), jit_compile=jit_compile, autograph=False)
-        concrete = function.get_concrete_function(*specs)
-        numbers = {id(handle): i for i, handle in enumerate(_handles(template, extra))}
-        captured = [numbers.get(id(x), x) for x in concrete.captured_inputs]
-        _programs[key] = _Program(concrete.inference_fn, captured, (concrete, template, extra))
-    program, handles = _programs[key], _handles(learner, variables)
+    if jit_compile:
+        require_xla()
+    sizes = learner.sizes()
+    if sizes is None:
+        program = _trace(make_function, specs, learner, variables, jit_compile)
+    else:
+        programs = _shared if not has_own_parts else {} if _of_this_study is None else _of_this_study
+        key = (key, sizes, tuple(specs), tuple((v.shape, v.dtype) for v in variables), jit_compile)
+        if key not in programs:
+            extra = [tf.Variable(tf.zeros_like(v)) for v in variables]
+            programs[key] = _trace(make_function, specs, _stand_in(sizes, jit_compile), extra, jit_compile)
+        program = programs[key]
+    handles = _handles(learner, variables)
     captured = [handles[x] if isinstance(x, int) else x for x in program.captured]
     # Calling the ConcreteFunction would first bind its arguments to a signature, which takes half as long as a step.
     call_flat = program.function.call_flat
-    return lambda *tensors: call_flat(*tensors, *captured)
+    call = lambda *tensors, _kept=program: call_flat(*tensors, *captured)  # noqa: E731
+    return call if sizes is not None else _saying_what_xla_refused(call)
+
+
+def _saying_what_xla_refused(call: Callable) -> Callable:
+    def checked(*tensors: tf.Tensor) -> list[tf.Tensor]:
+        try:
+            return call(*tensors)
+        except tf.errors.OpError as error:  # the first call compiles
+            if "unsupported operations" not in error.message:
+                raise
+            operations = ", ".join(sorted(set(re.findall(r"No registered '(\w+)'", error.message))))
+            raise ValueError(
+                "jit_compile must be False for this network, optimizer, targets or loss: XLA cannot compile "
+                f"{operations}"
+            ) from error
+
+    return checked
+
+
+def _trace(
+    make_function: Callable, specs: Sequence, learner: Learner, variables: Sequence[tf.Variable], jit_compile: bool
+) -> _Program:
+    function = tf.function(make_function(learner, variables), jit_compile=jit_compile, autograph=False)
+    concrete = function.get_concrete_function(*specs)
+    numbers = {id(handle): i for i, handle in enumerate(_handles(learner, variables))}
+    captured = [numbers.get(id(x), x) for x in concrete.captured_inputs]
+    return _Program(concrete.inference_fn, captured, (concrete, learner, variables))
 
 
 def _handles(learner: Learner, variables: Sequence[tf.Variable]) -> list[tf.Tensor]:

@@ -15,9 +15,10 @@ import matplotlib.pyplot as plt
 
 from dqn_keras import environments
 from dqn_keras._tensorflow import keras
-from dqn_keras.checkpoint import load_agent, replacing, versions
+from dqn_keras.checkpoint import load_agent, replacing
 from dqn_keras.config import Config
 from dqn_keras.diagnostics import Logged
+from dqn_keras.identity import versions
 from dqn_keras.plotting import plot_history, plot_study
 from dqn_keras.study import load_study
 from dqn_keras.training import Run, check_environment, train

@@ -9,6 +9,7 @@ import pickle
 import signal
 import threading
 import time
+import uuid
 import warnings
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
@@ -23,16 +24,10 @@ from joblib import Parallel, cpu_count, delayed, parallel_config
 
 from dqn_keras._tensorflow import tf
 from dqn_keras.agent import recycle
-from dqn_keras.checkpoint import (
-    FORMAT,
-    check_is_same,
-    from_bytes,
-    identity,
-    replacing,
-    to_bytes,
-    warn_of_other_versions,
-)
+from dqn_keras.checkpoint import FORMAT, from_bytes, replacing, to_bytes
 from dqn_keras.config import Config, count
+from dqn_keras.identity import check_is_same, identity, warn_of_other_versions
+from dqn_keras.programs import shared_in
 from dqn_keras.progress import tqdm
 from dqn_keras.training import check_arguments, train
 
@@ -160,43 +155,54 @@ _SECONDS_BETWEEN_SAVES = 10
 _Results = Generator[Outcome | None, None, None]
 
 
-def _recipe(env: gym.Env | FuncEnv) -> bytes:
-    """What a worker makes its environment from: a copy, or, if it cannot be copied, as after rendering, its spec."""
+class _Recipe(NamedTuple):
+    """What a worker makes its environment from."""
+
+    pickled: bytes
+    study: str
+    """Tells this call of `study` from others, in which the environment may have been another."""
+
+
+def _recipe(env: gym.Env | FuncEnv) -> _Recipe:
+    """A copy of the environment, or, if it cannot be copied, as after rendering, its spec."""
     try:
-        return cloudpickle.dumps(env)
+        pickled = cloudpickle.dumps(env)
     except (TypeError, AttributeError, pickle.PicklingError):
         if not (isinstance(env, gym.Env) and env.spec):
             raise
-        return cloudpickle.dumps(env.spec)
+        pickled = cloudpickle.dumps(env.spec)
+    return _Recipe(pickled, uuid.uuid4().hex)
 
 
 @functools.lru_cache(maxsize=1)
-def _env(recipe: bytes) -> gym.Env | FuncEnv:
-    """The process's own environment, made once, so that its program is compiled once."""
-    env = cloudpickle.loads(recipe)
-    return gym.make(env) if isinstance(env, gym.envs.registration.EnvSpec) else env
+def _parts(recipe: _Recipe) -> tuple[gym.Env | FuncEnv, dict]:
+    """The process's own environment, and the programs compiled for it: made once in a study."""
+    env = cloudpickle.loads(recipe.pickled)
+    return gym.make(env) if isinstance(env, gym.envs.registration.EnvSpec) else env, {}
 
 
-def _train_seed(recipe: bytes, config: Config, seed: int) -> Outcome | None:
+def _train_seed(recipe: _Recipe, config: Config, seed: int) -> Outcome | None:
     """One agent, in whatever process; None if it was interrupted there."""
-    run = train(_env(recipe), config, seed, verbose=0)
+    env, programs = _parts(recipe)
+    with shared_in(programs):
+        run = train(env, config, seed, verbose=0)
     if run.interrupted:
         return None
     weights = [*run.q_network.get_weights(), *run.q_hat_network.get_weights()]
     digest = hashlib.sha256(b"".join(w.tobytes() for w in weights)).digest()
     steps = np.array([episode.steps for episode in run.episodes], np.int64)
-    recycle(run.agent, config)
+    recycle(run.agent)
     return Outcome(seed, run.rewards, steps, run.solved_at, digest)
 
 
-def _train_seed_in_worker(recipe: bytes, config: Config, seed: int) -> Outcome | None:
+def _train_seed_in_worker(recipe: _Recipe, config: Config, seed: int) -> Outcome | None:
     """The same in a process of its own. TensorFlow gets one thread there: there is a process for each core."""
     with contextlib.suppress(RuntimeError):  # it has started already, in a worker that someone else has used
         tf.config.threading.set_intra_op_parallelism_threads(1)
     return _train_seed(recipe, config, seed)
 
 
-def _by_joblib(recipe: bytes, config: Config, seeds: list[int], num_workers: int) -> _Results:
+def _by_joblib(recipe: _Recipe, config: Config, seeds: list[int], num_workers: int) -> _Results:
     if num_workers == 1 or len(seeds) <= 1:
         yield from (_train_seed(recipe, config, seed) for seed in seeds)
         return
@@ -219,7 +225,7 @@ def _interrupts_ignored_by_children() -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
 
 
-def _by_ray(recipe: bytes, config: Config, seeds: list[int], _: int) -> _Results:
+def _by_ray(recipe: _Recipe, config: Config, seeds: list[int], _: int) -> _Results:
     try:
         import ray
     except ImportError:

@@ -14,14 +14,22 @@ from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras import compiled_loop, gymnasium_loop
 from dqn_keras._tensorflow import keras
-from dqn_keras.agent import Agent, DivergedError, Episode, checked_seed, make_agent
+from dqn_keras.agent import (
+    Agent,
+    DivergedError,
+    Episode,
+    checked_seed,
+    make_agent,
+    optimizer_shown,
+    owners_optimizer,
+)
 from dqn_keras.checkpoint import Checkpoints, save_agent
 from dqn_keras.config import Config, count
 from dqn_keras.diagnostics import Log, Logged, history
-from dqn_keras.environment import CheckedEnv, Spaces
+from dqn_keras.environment import CheckedEnv, Spaces, some_states
 from dqn_keras.interruption import stop_requests
-from dqn_keras.learn import check_loss, loss_values
-from dqn_keras.networks import check_fits
+from dqn_keras.learn import Formulas, td_targets
+from dqn_keras.networks import check_fits, warn_of_inference_mode
 from dqn_keras.progress import tqdm
 
 
@@ -89,14 +97,19 @@ def train(
     seed: int | None = None,
     *,
     q_network: keras.Model | None = None,
-    loss: Callable = loss_values,
-    verbose: int = 1,
+    optimizer: keras.Optimizer | None = None,
+    targets: Callable = td_targets,
+    loss: str | Callable | None = None,
     callbacks: keras.callbacks.Callback | Sequence[keras.callbacks.Callback] = (),
     checkpoint: str | os.PathLike | None = None,
     checkpoint_every: int = 100,
     resume: bool = False,
+    verbose: int = 1,
 ) -> Run:
-    """Train a Deep Q-Network until it solves `env` or `config.num_episodes` are over.
+    """Trains a Deep Q-Network until it solves `env` or `config.num_episodes` are over.
+
+    What you pass in is what runs: your network, optimizer, targets, loss and environment are used as the objects they
+    are, and compiled again at each call of `train`, so that a change you made since is seen.
 
     Args:
         env: a gymnasium.Env with a Box observation space and a Discrete action space; or a functional one
@@ -104,13 +117,17 @@ def train(
             as `dqn_keras.environments.CartPole()`.
         config: the parameters; by default the original notebook's.
         seed: a whole number. One seed, one result, bit for bit, on one machine; None draws one (see `run.seed`).
-        q_network: a network of your own, states [B, *S] -> Q-values [B, A]: a built Sequential or functional model,
-            trained in place from the weights it has, by Adam with `config.alpha`; Q-hat starts as its equal copy. By
-            default that of `make_q_network`, for observations of one axis. Where observations are uint8, as images are,
-            they stay that in the memory, and the network scales them (keras.layers.Rescaling(1 / 255)).
-        loss: a function in the place of `loss_values`: (experiences, gamma, q_network, q_hat_network) -> scalar
-            tensor, `experiences` being an Experience of tensors with a leading axis B.
-        verbose: 1 prints a line every 100 episodes and one when solved, 2 shows a progress bar beside them, 0 nothing.
+        q_network: a network of your own, states [B, *S] -> Q-values [B, A] float32: a built Sequential or functional
+            model, trained in place from the weights it has; Q-hat starts as its equal copy. Its layers are called in
+            inference mode, and its regularization losses are added to the loss. By default that of `make_q_network`,
+            for observations of one axis. Where observations are uint8, as images are, they stay that in the memory, and
+            the network scales them (keras.layers.Rescaling(1 / 255)).
+        optimizer: a Keras optimizer. By default that of a `q_network` which you have compiled, or else Adam with
+            `config.alpha`. With an optimizer of your own, `config.alpha` must be left as it is.
+        targets: the formula for y: `td_targets`, `double_td_targets`, or a function of the same form. No gradient flows
+            through it.
+        loss: what Keras takes in `compile`: a name, a `keras.losses.Loss`, or a function of (y, q), both [B] -> a
+            scalar or [B], which is averaged. By default that of a `q_network` which you have compiled, or else "mse".
         callbacks: Keras callbacks; an episode is an epoch of one batch, and its logs are what `run.history` holds.
             They see the network as the episode left it, may change it, and may set `model.stop_training`. So compiled
             episodes are then played one at a time, unless all callbacks are plain keras.callbacks.CSVLogger.
@@ -120,9 +137,10 @@ def train(
         checkpoint_every: episodes between two of them, or a few more where episodes are compiled; the start and the
             end of the run are saved too.
         resume: go on from the newest checkpoint in the folder that is whole, or start if there is none yet. The
-            result is that of a run that was never interrupted, bit for bit; `config`, `env`, `loss` (which is known
-            by its name) and the layers of `q_network` must be the same, but for a num_episodes that may be larger.
-            What callbacks remember is theirs to save.
+            result is that of a run that was never interrupted, bit for bit; everything else must be the same, but for a
+            num_episodes that may be larger. What callbacks remember is theirs to save. With a checkpoint, functions and
+            classes of your own need a name that can be imported; that and their source tell whether they are the same.
+        verbose: 1 prints a line every 100 episodes and one when solved, 2 shows a progress bar beside them, 0 nothing.
 
     Ctrl-C, an interrupted notebook cell and SIGTERM end the run at the end of an episode, saved if there is a
     checkpoint, and `train` returns what there is, marked `interrupted`; a second one raises KeyboardInterrupt.
@@ -133,7 +151,6 @@ def train(
             step); learning diverged.
     """
     check_arguments(env, config, verbose)
-    check_loss(loss)
     callbacks = [callbacks] if isinstance(callbacks, keras.callbacks.Callback) else list(callbacks)
     for callback in callbacks:
         if not isinstance(callback, keras.callbacks.Callback):
@@ -142,21 +159,31 @@ def train(
         raise ValueError("resume needs a folder to resume from: checkpoint, got None")
     checkpoint_every = count("checkpoint_every", checkpoint_every)
     spaces = check_environment(env, q_network)
-    agent = make_agent(
-        spaces.state_shape, spaces.num_actions, config, checked_seed(seed), q_network, spaces.state_dtype
-    )
-    checkpoints = None
+    formulas = _check_own_parts(config, q_network, optimizer, targets, loss)
     if checkpoint is not None:
-        checkpoints = Checkpoints(checkpoint, env, config, q_network, loss)
+        checkpoints = Checkpoints(checkpoint, env, config, q_network, optimizer, formulas)
+    else:
+        checkpoints = None
+    agent = make_agent(
+        spaces.state_shape,
+        spaces.num_actions,
+        config,
+        checked_seed(seed),
+        q_network,
+        optimizer,
+        some_states(env.observation_space, spaces.state_dtype),
+        spaces.state_dtype,
+    )
+    if checkpoints:
         _start_or_resume(checkpoints, agent, seed, resume, verbose)
 
     if isinstance(env, FuncEnv):
         # A callback may change the agent between episodes, and sees it as it then is.
         only_logs = all(type(callback) is keras.callbacks.CSVLogger for callback in callbacks)
         episodes_per_call = min(100, checkpoint_every) if only_logs else 1
-        episodes = compiled_loop.episodes(env, spaces, agent, config, episodes_per_call, loss)
+        episodes = compiled_loop.episodes(env, spaces, agent, config, episodes_per_call, formulas)
     else:
-        episodes = gymnasium_loop.episodes(CheckedEnv(env), agent, config, loss)
+        episodes = gymnasium_loop.episodes(CheckedEnv(env), agent, config, formulas)
     saved_at = len(agent.episodes)
     speeds = [math.nan] * saved_at
     played = _timed(episodes, agent, speeds)
@@ -166,7 +193,7 @@ def train(
     is_over, diverged = _is_solved(agent.episodes, config), False  # a resumed run may be solved
     bar = tqdm(total=config.num_episodes, initial=saved_at, unit="episode", disable=verbose < 2)
     say = bar.write if verbose == 2 else print
-    with stop_requests() as is_asked_to_stop, bar:
+    with stop_requests() as is_asked_to_stop, bar, optimizer_shown(agent):
         with contextlib.closing(played):
             while not is_over:
                 try:
@@ -192,6 +219,7 @@ def train(
         if checkpoints and not diverged and (callbacks or len(agent.episodes) > saved_at):
             _save_or_warn(checkpoints, agent)  # after on_train_end, in which a callback may change the agent
         interrupted = is_asked_to_stop()
+    agent.optimizer.finalize_variable_values(agent.q_network.trainable_variables)  # as `fit` does: averages, if it has
 
     run = Run(config, agent, interrupted, diverged, speeds)
     if verbose and run.solved_at is not None:
@@ -236,6 +264,50 @@ def check_environment(env: gym.Env | FuncEnv, q_network: keras.Model | None = No
             "q_network must be a network of your own, got None (or wrap env in gymnasium.wrappers.FlattenObservation)"
         )
     return spaces
+
+
+def _check_own_parts(
+    config: Config,
+    q_network: keras.Model | None,
+    optimizer: keras.Optimizer | None,
+    targets: Callable,
+    loss: str | Callable | None,
+) -> Formulas:
+    """The formulas to learn by; TypeError, ValueError or a warning for what cannot be used, or not as it is meant."""
+    if optimizer is not None and not isinstance(optimizer, keras.Optimizer):
+        raise TypeError(f"optimizer must be a Keras optimizer such as keras.optimizers.Adam(1e-3), got {optimizer!r}")
+    owners = None if q_network is None else owners_optimizer(q_network)
+    if owners is not None:
+        if loss is None:
+            loss = getattr(q_network, "loss", None)
+        config_of_compile = getattr(getattr(q_network, "_compile_config", None), "config", {})
+        ignored = [x for x in ("metrics", "weighted_metrics", "loss_weights") if config_of_compile.get(x)]
+        if ignored:
+            warnings.warn(f"{', '.join(ignored)} of q_network.compile are not used by train", stacklevel=3)
+    formulas = Formulas(targets, "mse" if loss is None else loss)
+    formulas.check()
+    if (in_use := optimizer or owners) is not None:
+        _check_learning_rate(in_use, config)
+    if q_network is not None:
+        warn_of_inference_mode(q_network)
+    return formulas
+
+
+def _check_learning_rate(optimizer: keras.Optimizer, config: Config) -> None:
+    """ValueError if alpha says something else; a warning if it is a Python function, which is not called each time."""
+    rate = optimizer.learning_rate
+    is_alpha = isinstance(rate, keras.Variable) and math.isclose(rate.numpy(), config.alpha, rel_tol=1e-6)
+    if config.alpha != Config.alpha and not is_alpha:
+        raise ValueError(
+            f"alpha must be left at its default of {Config.alpha} with an optimizer of your own, whose learning rate "
+            f"counts, got {config.alpha}"
+        )
+    if isinstance(rate, int | float):
+        warnings.warn(
+            f"the learning rate of {optimizer.name!r} is a Python function, which is called once, when the learning "
+            f"step is compiled: it stays at {rate}; a keras.optimizers.schedules.LearningRateSchedule would change",
+            stacklevel=4,
+        )
 
 
 def _is_solved(episodes: Sequence[Episode], config: Config) -> bool:
