@@ -285,7 +285,8 @@ def _compiled_step(learner: Learner, formulas: Formulas, jit_compile: bool) -> C
             break
     formulas.check()
     learner.prepare()
-    warn_of_inference_mode(learner.q_network)
+    if not steps.num_compiled:
+        warn_of_inference_mode(learner.q_network)
     call = _bind_step(learner, formulas, jit_compile)
     steps.kept = [*steps.kept[1 - _MOST_KEPT :], _Step(parts, Watch(*parts), call)]
     steps.num_compiled += 1

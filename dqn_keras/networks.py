@@ -113,7 +113,7 @@ def copy(network: keras.Model, states: np.ndarray | None = None) -> keras.Model:
     Raises:
         ValueError: a layer cannot be copied, or its copy computes something else; the message names the layer.
     """
-    with python_random_kept():
+    with python_random_kept(), keras.saving.custom_object_scope(_own_names(network)):
         second = keras.models.clone_model(network, clone_function=_copy_layer, recursive=True)
     second.set_weights(network.get_weights())
     finalize_layers(second)
@@ -132,16 +132,27 @@ def finalize_layers(network: keras.Model) -> None:
 
 def _copy_layer(layer: keras.layers.Layer) -> keras.layers.Layer:
     try:
-        if type(layer) is keras.layers.Lambda:  # from_config wants code from a file to be trusted; this is none
-            config = {key: x for key, x in layer.get_config().items() if key in ("name", "trainable", "dtype")}
-            output_shape = layer._output_shape
-            return keras.layers.Lambda(layer.function, output_shape, layer.mask, layer.arguments, **config)
-        return type(layer).from_config(layer.get_config())
+        config = layer.get_config()
+        if type(layer) is keras.layers.Lambda:  # whose from_config wants code from a file to be trusted; this is none
+            names = {key: x for key, x in config.items() if key in ("name", "trainable", "dtype")}
+            return keras.layers.Lambda(layer.function, layer._output_shape, layer.mask, layer.arguments, **names)
+        by_name = {key: getattr(layer, key, None) for key in config}  # Keras writes functions down as names
+        return type(layer).from_config(config | {key: x for key, x in by_name.items() if isinstance(x, _BY_NAME)})
     except Exception as error:  # whatever a layer's own code says
         raise ValueError(
             f"q_network cannot be copied for Q-hat: layer {layer.name!r} ({type(layer).__name__}) needs a get_config() "
-            f"that returns what its __init__ takes ({error})"
+            f"that returns what its __init__ takes ({str(error).splitlines()[0]})"
         ) from error
+
+
+_BY_NAME = (FunctionType, keras.regularizers.Regularizer, keras.constraints.Constraint)
+
+
+def _own_names(network: keras.Model) -> dict[str, Any]:
+    """Functions and classes that the layers use and Keras may not know, by name."""
+    parts = [x for layer in all_layers(network) for x in (type(layer), *vars(layer).values())]
+    parts = [x if isinstance(x, FunctionType | type) else type(x) for x in parts]
+    return {x.__name__: x for x in parts if not (x.__module__ or "").startswith(("keras.", "builtins"))}
 
 
 def _carry_attributes(layer: keras.layers.Layer, copied: keras.layers.Layer) -> None:
@@ -202,6 +213,8 @@ def warn_of_inference_mode(network: keras.Model) -> None:
 def _differs_in_training(layer: keras.layers.Layer) -> bool:
     if isinstance(layer, keras.layers.BatchNormalization | keras.layers.SpectralNormalization):
         return True
+    if type(layer).__name__.endswith("Cell"):  # whose RNN is one of the layers, too
+        return False
     if not type(layer).__module__.startswith("keras."):
         return "training" in inspect.signature(type(layer).call).parameters
     rates = (getattr(layer, name, 0) for name in ("rate", "stddev", "dropout", "recurrent_dropout", "_dropout"))

@@ -11,7 +11,10 @@ import re
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+from tensorflow.python.framework import ops
+
 from dqn_keras._tensorflow import keras, require_xla, tf
+from dqn_keras.graphs import fingerprint
 from dqn_keras.networks import make_q_network, units_if_made_here
 
 
@@ -126,13 +129,15 @@ def _narrow_product(x: tf.Tensor, kernel: tf.Tensor) -> tuple[tf.Tensor, Callabl
 
 class _Program(NamedTuple):
     function: Any
+    """TensorFlow's, to be called with tensors alone."""
     captured: list[int | tf.Tensor]
-    """What the function takes beside its arguments: the number of one of the stand-in's variables, or a constant."""
-    kept_alive: Any
+    """What the function takes beside its arguments: the number of one of the learner's variables, or a constant."""
 
 
 _shared: dict[Hashable, _Program] = {}
 _of_this_study: dict[Hashable, _Program] | None = None
+_compiled: dict[Hashable, Any] = {}
+"""Functions traced from the user's parts, by their fingerprint: what XLA compiled for them stays in memory anyway."""
 
 
 @contextlib.contextmanager
@@ -207,11 +212,29 @@ def _saying_what_xla_refused(call: Callable) -> Callable:
 def _trace(
     make_function: Callable, specs: Sequence, learner: Learner, variables: Sequence[tf.Variable], jit_compile: bool
 ) -> _Program:
+    """The program, traced on these very objects. If an equal one was compiled before, that is used."""
     function = tf.function(make_function(learner, variables), jit_compile=jit_compile, autograph=False)
-    concrete = function.get_concrete_function(*specs)
+    with _custom_gradients_forgotten():
+        concrete = function.get_concrete_function(*specs)
     numbers = {id(handle): i for i, handle in enumerate(_handles(learner, variables))}
     captured = [numbers.get(id(x), x) for x in concrete.captured_inputs]
-    return _Program(concrete.inference_fn, captured, (concrete, learner, variables))
+    concrete = _compiled.setdefault((fingerprint(concrete), jit_compile), concrete)
+    return _Program(concrete.inference_fn, captured)
+
+
+@contextlib.contextmanager
+def _custom_gradients_forgotten() -> Iterator[None]:
+    """Forgets the gradients of tf.custom_gradient that are registered within, each of which keeps a whole graph alive.
+
+    They are there to differentiate a function once more, which nobody does with a program.
+    """
+    registry = ops.gradient_registry._registry
+    before = set(registry)
+    try:
+        yield
+    finally:
+        for name in set(registry) - before:
+            del registry[name]
 
 
 def _handles(learner: Learner, variables: Sequence[tf.Variable]) -> list[tf.Tensor]:

@@ -1,0 +1,105 @@
+"""Whatever Keras offers as a network, an optimizer or a loss does here what it does in an eager Keras step."""
+
+import warnings
+
+import gymnasium as gym
+import keras
+import numpy as np
+import pytest
+
+from dqn_keras import Config, evaluate, learn, train
+from tests.parts import INFERENCE_ONLY, LOSSES, NETWORKS, OPTIMIZERS, eager_step
+
+GAMMA, TAU, NUM_STEPS = 0.9, 0.2, 5
+ALL_NETWORKS = NETWORKS | INFERENCE_ONLY
+
+
+def two_of(make_network):
+    """Two networks, made apart, of equal weights."""
+    first, second = make_network(), make_network()
+    second.set_weights(first.get_weights())
+    return first, second
+
+
+def compare_with_eager_steps(make_network, make_optimizer, loss, random_batch, jit_compile):
+    ours, theirs = two_of(make_network)
+    our_hat, their_hat = two_of(make_network)
+    for hat in (our_hat, their_hat):
+        hat.set_weights([0.9 * w if w.dtype == np.float32 else w for w in ours.get_weights()])
+    our_optimizer, their_optimizer = make_optimizer(), make_optimizer()
+    start = ours.get_weights()
+    for _ in range(NUM_STEPS):
+        batch = random_batch(16)
+        value = learn(batch, GAMMA, ours, our_hat, our_optimizer, tau=TAU, loss=loss, jit_compile=jit_compile)
+        assert float(value) == pytest.approx(
+            eager_step(batch, GAMMA, TAU, theirs, their_hat, their_optimizer, loss), rel=2e-3, abs=1e-5
+        )
+    for a, b in zip(
+        ours.get_weights() + our_hat.get_weights(), theirs.get_weights() + their_hat.get_weights(), strict=True
+    ):
+        np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-5)
+    assert not all(map(np.array_equal, start, ours.get_weights()))
+
+
+@pytest.mark.parametrize("jit_compile", [True, False], ids=["jit", "no jit"])
+@pytest.mark.parametrize("name", ALL_NETWORKS)
+@pytest.mark.filterwarnings("ignore:q_network is called in inference mode")
+def test_a_network_learns_as_in_an_eager_keras_step(name, jit_compile, random_batch):
+    compare_with_eager_steps(ALL_NETWORKS[name], lambda: keras.optimizers.SGD(0.02), "mse", random_batch, jit_compile)
+
+
+@pytest.mark.parametrize("jit_compile", [True, False], ids=["jit", "no jit"])
+@pytest.mark.parametrize("name", OPTIMIZERS)
+def test_an_optimizer_learns_as_in_an_eager_keras_step(name, jit_compile, random_batch):
+    compare_with_eager_steps(NETWORKS["dense"], OPTIMIZERS[name], "mse", random_batch, jit_compile)
+
+
+@pytest.mark.parametrize("jit_compile", [True, False], ids=["jit", "no jit"])
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_loss_is_the_one_that_keras_compiles(name, jit_compile, random_batch):
+    make_optimizer = lambda: keras.optimizers.SGD(0.02)  # noqa: E731
+    compare_with_eager_steps(NETWORKS["dense"], make_optimizer, LOSSES[name], random_batch, jit_compile)
+
+
+class Recorded(gym.Wrapper):
+    """Writes down every state and action."""
+
+    def __init__(self):
+        super().__init__(gym.make("CartPole-v1"))
+        self.states, self.actions = [], []
+
+    def reset(self, **kwargs):
+        state, info = self.env.reset(**kwargs)
+        self.state = state
+        return state, info
+
+    def step(self, action):
+        self.states.append(self.state)
+        self.actions.append(int(action))
+        self.state, *others = self.env.step(action)
+        return self.state, *others
+
+
+@pytest.mark.parametrize("name", ALL_NETWORKS)
+@pytest.mark.filterwarnings("ignore:q_network is called in inference mode", "ignore:train ended without an update")
+def test_acting_q_hat_and_evaluate_play_the_function_that_the_network_is(name):
+    network, env = ALL_NETWORKS[name](), Recorded()
+    greedy = Config(num_episodes=3, max_steps=10, batch_size=30, memory_size=30, epsilon=0.0, epsilon_min=0.0)
+    run = train(env, greedy, seed=0, q_network=network, verbose=0)
+    evaluate(env, network, num_episodes=3, seed=0, max_steps=10)
+    states = np.array(env.states)
+    values = network(states).numpy()
+    chosen = values[np.arange(len(states)), env.actions]
+    np.testing.assert_allclose(chosen, values.max(axis=1), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(run.q_hat_network(states), values, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ALL_NETWORKS)
+def test_a_layer_that_differs_in_training_is_told_once_and_no_other_is(name, random_batch):
+    q_network, q_hat_network = two_of(ALL_NETWORKS[name])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            learn(random_batch(), GAMMA, q_network, q_hat_network, keras.optimizers.SGD(0.01), jit_compile=False)
+    told = [str(w.message) for w in caught if "inference mode" in str(w.message)]
+    assert len(told) == (name in INFERENCE_ONLY)
