@@ -24,7 +24,7 @@ from dqn_keras.agent import make_agent
 from dqn_keras.checkpoint import Checkpoints
 from dqn_keras.environment import CheckedEnv
 from dqn_keras.environments import CartPole
-from dqn_keras.programs import _programs
+from dqn_keras.programs import _shared
 from tests import faults
 from tests.test_config import bad_fields, refused
 
@@ -100,7 +100,7 @@ def cost_of_compiled_checks(rounds: int = 30) -> dict[str, str]:
     loops = []
     for is_all_finite in (checks, lambda *_: tf.constant(True)):
         compiled_loop.is_all_finite = diagnostics.is_all_finite = is_all_finite
-        _programs.clear()
+        _shared.clear()
         agent = make_agent((4,), 2, config, 0)
         loop = compiled_loop.episodes(CartPole(), compiled_loop.check_functional(CartPole()), agent, config)
         while agent.memory.num_appended < 60_000:

@@ -43,9 +43,9 @@ def identity(
         "config": dataclasses.asdict(config),
         "environment": describe(env),
         "q_network": "the default" if q_network is None else _describe_network(q_network),
-        "optimizer": "the default" if optimizer is None else _describe_part("optimizer", optimizer),
-        "targets": _describe_part("targets", formulas.targets),
-        "loss": _describe_part("loss", formulas.loss),
+        "optimizer": "the default" if optimizer is None else _in_words("optimizer", optimizer),
+        "targets": _in_words("targets", formulas.targets),
+        "loss": _in_words("loss", formulas.loss),
         "versions": versions(),
     }
     return json.loads(json.dumps(facts))  # tuples become lists
@@ -98,7 +98,12 @@ def _describe_layer(layer: keras.layers.Layer) -> Any:
     if is_of_a_library(type(layer).__module__):
         return [arrays, functions]
     numbers = {name: x for name, x in vars(layer).items() if name[0] != "_" and isinstance(x, int | float | str)}
-    return [arrays, functions, {**numbers, "built": True}, _describe_code("q_network", type(layer))]
+    return [arrays, functions, {**numbers, "built": True, "name": ""}, _describe_code("q_network", type(layer))]
+
+
+def _in_words(argument: str, part: Any) -> str:
+    description = _describe_part(argument, part)
+    return description if isinstance(description, str) else json.dumps(description)
 
 
 def _describe_part(argument: str, part: Any) -> Any:
@@ -109,31 +114,35 @@ def _describe_part(argument: str, part: Any) -> Any:
         return _describe_code(argument, part)
     if isinstance(part, keras.Variable):
         return _plain(part.numpy())
-    if isinstance(part, list | tuple):
-        return [_describe_part(argument, x) for x in part]
+    if isinstance(part, list | tuple | set | frozenset):
+        return [_describe_part(argument, x) for x in (sorted(part) if isinstance(part, set | frozenset) else part)]
     if isinstance(part, dict):
         return {str(name): _describe_part(argument, x) for name, x in part.items()}
     if isinstance(part, keras.Optimizer):
         settings = {name: x for name, x in vars(part).items() if _is_a_setting(name, x)}
-    elif hasattr(part, "get_config"):
-        settings = {**part.get_config(), "name": None}
-        if not is_of_a_library(type(part).__module__):
-            settings |= vars(part)
     elif hasattr(part, "__dict__"):
-        settings = vars(part)
+        is_library = is_of_a_library(type(part).__module__)
+        settings = {name: x for name, x in vars(part).items() if _is_data(x) or not is_library}
     else:
         return _plain(part)
     settings = {name: _describe_part(argument, x) for name, x in sorted(settings.items())}
     return {"class": _describe_code(argument, type(part)), **settings}
 
 
+def _is_data(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(map(_is_data, value.values()))
+    if isinstance(value, list | tuple):
+        return all(map(_is_data, value))
+    return value is None or isinstance(value, bool | int | float | str | np.ndarray | np.generic)
+
+
 def _is_a_setting(name: str, value: Any) -> bool:
     """Of an optimizer's attributes: not its name, its variables and the books that it keeps of them."""
-    if isinstance(value, set | list | tuple):
-        return "exclude" in name
-    is_plain = value is None or isinstance(value, bool | int | float | str)
+    if isinstance(value, set | list | tuple):  # names excluded from weight decay; variables are excluded by their ids
+        return "exclude" in name and all(isinstance(x, str) for x in value)
     is_part = name in ("_learning_rate", "inner_optimizer")
-    return is_part or (is_plain and name not in ("name", "built", "_lock"))
+    return is_part or (_is_data(value) and name not in ("name", "built", "_lock"))
 
 
 def _describe_code(argument: str, code: Any) -> Any:

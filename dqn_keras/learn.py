@@ -11,7 +11,7 @@ from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 from dqn_keras._tensorflow import keras, tf
-from dqn_keras.networks import check_network, warn_of_inference_mode
+from dqn_keras.networks import all_layers, check_network, warn_of_inference_mode
 from dqn_keras.programs import Learner, bind
 from dqn_keras.replay import Experience, as_batch, as_share
 from dqn_keras.watching import Watch
@@ -288,7 +288,7 @@ def _compiled_step(learner: Learner, formulas: Formulas, jit_compile: bool) -> C
     if not steps.num_compiled:
         warn_of_inference_mode(learner.q_network)
     call = _bind_step(learner, formulas, jit_compile)
-    steps.kept = [*steps.kept[1 - _MOST_KEPT :], _Step(parts, Watch(*parts), call)]
+    steps.kept = [*steps.kept[1 - _MOST_KEPT :], _Step(parts, _watch(learner, parts), call)]
     steps.num_compiled += 1
     if steps.num_compiled == _MOST_KEPT:
         warnings.warn(
@@ -297,6 +297,10 @@ def _compiled_step(learner: Learner, formulas: Formulas, jit_compile: bool) -> C
             stacklevel=3,
         )
     return call
+
+
+def _watch(learner: Learner, parts: Sequence[Any]) -> Watch:
+    return Watch(*parts, *all_layers(learner.q_network), *all_layers(learner.q_hat_network))
 
 
 def _bind_step(learner: Learner, formulas: Formulas, jit_compile: bool) -> Callable[..., list[tf.Tensor]]:

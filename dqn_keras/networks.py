@@ -113,13 +113,15 @@ def copy(network: keras.Model, states: np.ndarray | None = None) -> keras.Model:
     Raises:
         ValueError: a layer cannot be copied, or its copy computes something else; the message names the layer.
     """
-    with python_random_kept(), keras.saving.custom_object_scope(_own_names(network)):
+    with python_random_kept(), _quiet_about_lambdas(), keras.saving.custom_object_scope(_own_names(network)):
         second = keras.models.clone_model(network, clone_function=_copy_layer, recursive=True)
     second.set_weights(network.get_weights())
     finalize_layers(second)
     for layer, copied in zip(all_layers(network), all_layers(second), strict=False):
         _carry_attributes(layer, copied)
     check_is_equal("q_network cannot be copied for Q-hat", network, second, states)
+    if network in _made_here:
+        _made_here.add(second)
     return second
 
 
@@ -139,10 +141,19 @@ def _copy_layer(layer: keras.layers.Layer) -> keras.layers.Layer:
         by_name = {key: getattr(layer, key, None) for key in config}  # Keras writes functions down as names
         return type(layer).from_config(config | {key: x for key, x in by_name.items() if isinstance(x, _BY_NAME)})
     except Exception as error:  # whatever a layer's own code says
+        why = " ".join(str(error).split())
         raise ValueError(
             f"q_network cannot be copied for Q-hat: layer {layer.name!r} ({type(layer).__name__}) needs a get_config() "
-            f"that returns what its __init__ takes ({str(error).splitlines()[0]})"
+            f"that returns what its __init__ takes ({why[:200]})"
         ) from error
+
+
+@contextlib.contextmanager
+def _quiet_about_lambdas() -> Iterator[None]:
+    """Keras warns of every lambda in a configuration, because a file with one is unsafe; this is no file."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="The object being serialized includes a `lambda`")
+        yield
 
 
 _BY_NAME = (FunctionType, keras.regularizers.Regularizer, keras.constraints.Constraint)
@@ -223,7 +234,8 @@ def _differs_in_training(layer: keras.layers.Layer) -> bool:
 
 def structure(network: keras.Model) -> str:
     """Equal for networks of one configuration, but for names and for initializers, which have done their work."""
-    return json.dumps(_without_names(network.get_config(), {}), sort_keys=True, default=repr)
+    with _quiet_about_lambdas():
+        return json.dumps(_without_names(network.get_config(), {}), sort_keys=True, default=repr)
 
 
 def _without_names(config: Any, numbers: dict[str, int]) -> Any:

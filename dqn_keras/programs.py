@@ -18,6 +18,12 @@ from dqn_keras.graphs import fingerprint
 from dqn_keras.networks import make_q_network, units_if_made_here
 
 
+def check_optimizer(optimizer: Any) -> None:
+    """TypeError if it is not one of Keras."""
+    if not isinstance(optimizer, keras.Optimizer):
+        raise TypeError(f"optimizer must be a Keras optimizer such as keras.optimizers.Adam(1e-3), got {optimizer!r}")
+
+
 class Learner(NamedTuple):
     """The three that a learning step changes."""
 
@@ -33,8 +39,7 @@ class Learner(NamedTuple):
     def prepare(self) -> None:
         """Checks that the three belong together, and builds the optimizer."""
         q_network, q_hat_network, optimizer = self
-        if not isinstance(optimizer, keras.Optimizer):
-            raise TypeError(f"optimizer must be a Keras optimizer, got {optimizer!r}")
+        check_optimizer(optimizer)
         if q_network is q_hat_network:
             raise ValueError("q_hat_network must be a second network, got q_network itself")
         shapes, hat_shapes = ([tuple(w.shape) for w in n.weights] for n in (q_network, q_hat_network))

@@ -30,6 +30,7 @@ from dqn_keras.environment import CheckedEnv, Spaces, some_states
 from dqn_keras.interruption import stop_requests
 from dqn_keras.learn import Formulas, td_targets
 from dqn_keras.networks import check_fits, warn_of_inference_mode
+from dqn_keras.programs import check_optimizer
 from dqn_keras.progress import tqdm
 
 
@@ -274,8 +275,8 @@ def _check_own_parts(
     loss: str | Callable | None,
 ) -> Formulas:
     """The formulas to learn by; TypeError, ValueError or a warning for what cannot be used, or not as it is meant."""
-    if optimizer is not None and not isinstance(optimizer, keras.Optimizer):
-        raise TypeError(f"optimizer must be a Keras optimizer such as keras.optimizers.Adam(1e-3), got {optimizer!r}")
+    if optimizer is not None:
+        check_optimizer(optimizer)
     owners = None if q_network is None else owners_optimizer(q_network)
     if owners is not None:
         if loss is None:

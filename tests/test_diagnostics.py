@@ -7,34 +7,38 @@ import pytest
 
 from dqn_keras import Config, make_networks, train
 from dqn_keras.agent import Episode
-from dqn_keras.diagnostics import Log, Measures, measured_step, sum_up
+from dqn_keras.diagnostics import Log, checked_step, sum_up
 from dqn_keras.environments import Acrobot, CartPole
-from dqn_keras.learn import loss_values
+from dqn_keras.learn import DEFAULT_FORMULAS, Formulas, Metrics, double_td_targets
 from dqn_keras.networks import q_values
 from dqn_keras.programs import Learner
 from dqn_keras.replay import as_batch
 from tests.environments import Corridor
 
 
-def test_the_measures_are_those_of_the_batch_before_the_step(random_batch):
+@pytest.mark.parametrize("is_double", [False, True], ids=["DQN", "Double DQN"])
+def test_the_metrics_are_those_of_the_batch_before_the_step_by_the_targets_in_use(random_batch, is_double):
     batch = random_batch(32)
     networks = make_networks(4, 2, seed=0)
-    networks[1].set_weights([w + 0.1 for w in networks[1].get_weights()])
+    networks[1].set_weights([0.1 - w for w in networks[1].get_weights()])
     q, q_hat = (network.get_weights() for network in networks)
     states, actions, rewards, next_states, terminal = batch
-    targets = rewards + (1 - terminal) * 0.95 * q_values(q_hat, next_states).max(axis=1)
+    next_values = q_values(q_hat, next_states)
+    chosen = q_values(q if is_double else q_hat, next_states).argmax(axis=1)
+    targets = rewards + (1 - terminal) * 0.95 * next_values[np.arange(32), chosen]
     errors = targets - q_values(q, states)[np.arange(32), actions]
     best = q_values(q, states).max(axis=1)
 
     learner = Learner(*networks, keras.optimizers.Adam())
     learner.prepare()
-    measures = measured_step(as_batch(batch, (4,), 2), learner, Config(), loss_values)
-    expected = Measures(np.mean(errors**2), best.mean(), best.max(), np.abs(errors).mean())
-    np.testing.assert_allclose(measures, expected, rtol=1e-4)
+    formulas = Formulas(double_td_targets) if is_double else DEFAULT_FORMULAS
+    metrics = checked_step(as_batch(batch, (4,), 2), learner, 0.95, 0.01, formulas)
+    expected = Metrics(np.mean(errors**2), best.mean(), best.max(), np.abs(errors).mean())
+    np.testing.assert_allclose(metrics, expected, rtol=1e-4)
 
 
 def test_an_episode_is_the_mean_of_its_updates_and_their_highest_q():
-    assert sum_up([Measures(1.0, 2.0, 3.0, 4.0), Measures(2.0, 4.0, 9.0, 0.0)]) == Measures(1.5, 3.0, 9.0, 2.0)
+    assert sum_up([Metrics(1.0, 2.0, 3.0, 4.0), Metrics(2.0, 4.0, 9.0, 0.0)]) == Metrics(1.5, 3.0, 9.0, 2.0)
     assert all(math.isnan(x) for x in sum_up([]))
 
 

@@ -8,8 +8,7 @@ import pytest
 import tensorflow as tf
 
 from dqn_keras import Experience, learn, loss_values, make_networks, update_q_hat
-from dqn_keras.learn import _bound_steps
-from dqn_keras.programs import _programs
+from dqn_keras.programs import _shared
 from tests.oracle import Oracle
 
 
@@ -99,7 +98,7 @@ def test_narrow_layers_learn_the_same_whether_compiled_or_not(num_actions):
     results = []
     for jit_compile in (True, False):
         q_network, q_hat_network = make_networks(3, num_actions, (8, 3), seed=0)
-        learn(batch, 0.95, q_network, q_hat_network, keras.optimizers.SGD(1.0), jit_compile=jit_compile)
+        learn(batch, 0.95, q_network, q_hat_network, keras.optimizers.Adam(0.1), jit_compile=jit_compile)
         results.append(q_network.get_weights())
     start = make_networks(3, num_actions, (8, 3), seed=0)[0].get_weights()
     for compiled, eager, before in zip(*results, start, strict=True):
@@ -169,12 +168,12 @@ def test_agents_do_not_touch_one_another(random_batch):
 
 def test_one_trace_for_all_agents_alike_whatever_the_batch(random_batch, caplog):
     learn(random_batch(), 0.95, *agent())
-    before = len(_programs)
+    before = len(_shared)
     for i, batch_size in enumerate([64, 64, 32, 1, 64, 64, 64]):
         networks = agent(seed=i, alpha=0.001 * (i + 1))
         learn(random_batch(batch_size), 0.9 + i / 100, *networks, tau=0.1 * (i + 1))
         learn([tf.constant(x) for x in random_batch(batch_size)], np.float32(0.9), *networks)
-    assert len(_programs) == before
+    assert len(_shared) == before
     assert "retracing" not in caplog.text
 
 
@@ -188,14 +187,12 @@ def test_agents_that_differ_in_more_than_numbers_have_programs_of_their_own(rand
     assert not np.array_equal(*updates)
 
 
-def test_a_layer_frozen_between_two_calls_stays_as_it_is_and_wants_an_optimizer_that_knows(random_batch):
+def test_a_layer_frozen_between_two_calls_stays_as_it_is(random_batch):
     q_network, q_hat_network, optimizer = agent()
     learn(random_batch(), 0.95, q_network, q_hat_network, optimizer)
     q_network.layers[0].trainable = False
     before = q_network.get_weights()
-    with pytest.raises(ValueError, match="optimizer must be built for q_network's trainable variables"):
-        learn(random_batch(), 0.95, q_network, q_hat_network, optimizer)
-    learn(random_batch(), 0.95, q_network, q_hat_network, keras.optimizers.Adam())
+    learn(random_batch(), 0.95, q_network, q_hat_network, optimizer)
     kernel, _, output, _ = q_network.get_weights()
     np.testing.assert_array_equal(kernel, before[0])
     assert not np.array_equal(output, before[2])
@@ -221,15 +218,11 @@ def test_fifty_dropped_agents_leave_no_memory_behind(random_batch):
 
 def test_an_agent_that_is_dropped_is_forgotten(random_batch):
     networks, batch = agent(), random_batch()
-    gc.collect()
-    before = len(_bound_steps)
     learn(batch, 0.95, *networks)
-    assert len(_bound_steps) == before + 1
     watched = [weakref.ref(x) for x in networks]
     del networks
     gc.collect()
     assert [reference() for reference in watched] == [None, None, None]
-    assert len(_bound_steps) == before
 
 
 def test_learn_can_be_called_in_a_tf_function(random_batch):
@@ -292,9 +285,9 @@ def test_networks_that_do_not_belong_together_are_refused(random_batch):
             learn(batch, gamma, q_network, q_hat_network, optimizer)
         with pytest.raises((TypeError, ValueError), match=r"^tau must be a finite number"):
             learn(batch, 0.95, q_network, q_hat_network, optimizer, tau=gamma)
-    with pytest.raises(TypeError, match=r"^optimizer must be a Keras optimizer, got 'adam'"):
+    with pytest.raises(TypeError, match=r"^optimizer must be a Keras optimizer .*, got 'adam'"):
         learn(batch, 0.95, q_network, q_hat_network, "adam")
     with pytest.raises(TypeError, match=r"^q_network must be a Keras model, got None"):
         learn(batch, 0.95, None, q_hat_network, optimizer)
-    with pytest.raises(ValueError, match="Unknown variable"):
+    with pytest.raises(ValueError, match=r"^optimizer must be a new one, or one that was built for this q_network"):
         learn(batch, 0.95, *make_networks(4, 2), optimizer)

@@ -1,6 +1,5 @@
 """A reader's own environment, network and loss."""
 
-import functools
 import random
 
 import gymnasium as gym
@@ -11,10 +10,9 @@ import tensorflow as tf
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.wrappers import FlattenObservation, TimeLimit
 
-from dqn_keras import Config, Experience, ReplayMemory, evaluate, learn, load_agent, loss_values, make_networks, train
+from dqn_keras import Config, Experience, ReplayMemory, evaluate, load_agent, make_networks, train
 from dqn_keras.environments import CartPole
 from dqn_keras.networks import structure
-from dqn_keras.programs import _programs
 from dqn_keras.replay import pack, unpack
 from tests.environments import Corridor
 
@@ -218,16 +216,6 @@ def test_a_run_with_a_network_of_the_readers_own_is_saved_and_gone_on_from(tmp_p
     other = keras.Sequential([keras.Input((6, 6, 1)), keras.layers.Flatten(), keras.layers.Dense(3)])
     with pytest.raises(ValueError, match=r"^q_network is 'Rescaling, Conv2D, Flatten, Dense .*, got 'Flatten, Dense "):
         train(Beacon(), QUICK, seed=0, q_network=other, checkpoint=tmp_path / "run", resume=True)
-    with pytest.raises(ValueError, match=r"^loss is 'loss_values' .*, got 'double_dqn_loss'"):
-        train(
-            Beacon(),
-            QUICK,
-            seed=0,
-            q_network=convolutional(),
-            loss=double_dqn_loss,
-            checkpoint=tmp_path / "run",
-            resume=True,
-        )
 
 
 def dueling():
@@ -238,18 +226,16 @@ def dueling():
     return keras.Model(inputs, value + advantage - keras.ops.mean(advantage, axis=-1, keepdims=True))
 
 
-def test_equal_networks_share_a_program_whatever_they_are_called(cartpole, tmp_path):
+def test_equal_networks_are_the_same_to_a_checkpoint_whatever_they_are_called(cartpole, tmp_path):
     first, second = dueling(), dueling()
     assert structure(first) == structure(second)
     whole = train(cartpole, QUICK, seed=0, q_network=first, verbose=0)
-    num_programs = len(_programs)
     run = train(cartpole, QUICK, seed=0, q_network=second, checkpoint=tmp_path, verbose=0)
-    assert len(_programs) == num_programs
     np.testing.assert_array_equal(weights(run), weights(whole))
     train(cartpole, QUICK, seed=0, q_network=dueling(), checkpoint=tmp_path, resume=True, verbose=0)
 
 
-def test_networks_that_differ_do_not_share_one_whatever_they_are_called():
+def test_networks_that_differ_are_told_apart_whatever_they_are_called():
     def named(activation):
         hidden = keras.layers.Dense(8, activation, name=activation)
         return keras.Sequential([keras.Input((4,)), hidden, keras.layers.Dense(2)])
@@ -364,57 +350,3 @@ def test_bad_memories_are_refused():
         ReplayMemory(5, (2,), np.int64)
     with pytest.raises(TypeError, match=r"^state_shape must be a tuple"):
         ReplayMemory(5, 2)
-
-
-# The loss
-
-
-def double_dqn_loss(experiences, gamma, q_network, q_hat_network):
-    states, actions, rewards, next_states, terminal_states = experiences
-    chosen = tf.argmax(q_network(next_states), axis=-1)
-    values = tf.gather(q_hat_network(next_states), chosen, batch_dims=1)
-    targets = tf.stop_gradient(rewards + (1 - terminal_states) * gamma * values)
-    return tf.reduce_mean(
-        keras.losses.huber(targets[:, None], tf.gather(q_network(states), actions, batch_dims=1)[:, None])
-    )
-
-
-@pytest.mark.parametrize("make_env", [lambda: gym.make("CartPole-v1"), CartPole], ids=["Gymnasium", "compiled"])
-def test_a_loss_of_the_readers_own_takes_the_place_of_loss_values(make_env):
-    def again(*arguments):
-        return loss_values(*arguments)
-
-    ours, same, double = (
-        train(make_env(), QUICK, seed=0, loss=x, verbose=0) for x in (loss_values, again, double_dqn_loss)
-    )
-    np.testing.assert_array_equal(weights(ours), weights(same))
-    assert not np.array_equal(weights(ours), weights(double))
-
-
-@pytest.mark.parametrize("jit_compile", [True, False])
-def test_learn_takes_a_loss_too(random_batch, jit_compile):
-    networks, optimizer, batch = make_networks(4, 2, seed=0), keras.optimizers.Adam(0.01), random_batch(16)
-    expected = double_dqn_loss([tf.constant(x) for x in batch], 0.9, *networks)
-    losses = [learn(batch, 0.9, *networks, optimizer, loss=double_dqn_loss, jit_compile=jit_compile) for _ in range(50)]
-    assert float(losses[0]) == pytest.approx(float(expected), rel=1e-5)
-    assert losses[-1] < 0.5 * losses[0]
-
-
-def test_a_loss_that_is_none_is_refused(random_batch, cartpole):
-    networks, optimizer = make_networks(4, 2, seed=0), keras.optimizers.Adam()
-    with pytest.raises(ValueError, match=r"^loss must return a scalar tensor, got shape \(None,\)"):
-        learn(random_batch(16), 0.9, *networks, optimizer, loss=lambda *parts: tf.square(parts[0][2]))
-    with pytest.raises(TypeError, match=r"^loss must be a function, or another hashable callable, got 'mse'"):
-        train(cartpole, loss="mse")
-
-
-def test_the_arguments_of_a_loss_are_part_of_its_name(cartpole, tmp_path):
-    first, second = (functools.partial(scaled_loss, scale) for scale in (1.0, 2.0))
-    train(cartpole, QUICK, seed=0, loss=first, checkpoint=tmp_path, verbose=0)
-    train(cartpole, QUICK, seed=0, loss=first, checkpoint=tmp_path, resume=True, verbose=0)
-    with pytest.raises(ValueError, match=r"^loss is \['scaled_loss', \[1\.0\].*, got \['scaled_loss', \[2\.0\]"):
-        train(cartpole, QUICK, seed=0, loss=second, checkpoint=tmp_path, resume=True)
-
-
-def scaled_loss(scale, *arguments):
-    return scale * loss_values(*arguments)

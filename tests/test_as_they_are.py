@@ -1,0 +1,760 @@
+"""What the user passes in is what runs: nothing stale, nothing lost, nothing replaced."""
+
+import functools
+import gc
+import os
+
+import gymnasium as gym
+import keras
+import numpy as np
+import psutil
+import pytest
+import tensorflow as tf
+from gymnasium.experimental.functional import FuncEnv
+
+from dqn_keras import Config, double_td_targets, learn, make_networks, td_targets, train
+from dqn_keras.agent import make_agent
+from dqn_keras.compiled_loop import episodes
+from dqn_keras.environment import check_spaces
+from dqn_keras.environments import CartPole
+from dqn_keras.environments import cartpole as cartpole_module
+from dqn_keras.programs import _compiled, _shared
+from tests import parts
+from tests.parts import NETWORKS, dense, sequential
+
+QUICK = Config(num_episodes=5, batch_size=8, max_steps=20, solved_reward=1e6)
+BOTH_LOOPS = pytest.mark.parametrize(
+    "make_env", [lambda: gym.make("CartPole-v1"), CartPole], ids=["Gymnasium", "compiled"]
+)
+
+
+def weights_of(*networks):
+    return np.concatenate([w.ravel() for network in networks for w in network.get_weights()])
+
+
+def trained(make_env=CartPole, config=QUICK, **own):
+    """The weights after a short run with the same seed."""
+    run = train(make_env(), config, seed=0, verbose=0, **own)
+    return weights_of(run.q_network, run.q_hat_network)
+
+
+def learned(batch, networks, optimizer, **own):
+    """The weights after one more step, from where the networks are."""
+    learn(batch, 0.9, *networks, optimizer, **own)
+    return networks[0].get_weights()
+
+
+# A change between two calls is seen
+
+
+FACTOR = 1.0
+
+
+def scaled_loss(y, q):
+    return FACTOR * tf.reduce_mean(tf.square(y - q))
+
+
+class Settings:
+    factor = 1.0
+
+
+def loss_by_attribute(y, q):
+    return Settings.factor * tf.reduce_mean(tf.square(y - q))
+
+
+def helper(x):
+    return tf.square(x)
+
+
+def loss_by_helper(y, q):
+    return tf.reduce_mean(helper(y - q))
+
+
+BENT = 1.0
+
+
+def bent(x):
+    return tf.sin(BENT * x)
+
+
+def changed_global(monkeypatch):
+    monkeypatch.setattr(__import__(__name__, fromlist="_"), "FACTOR", 3.0)
+
+
+def changed_attribute(monkeypatch):
+    monkeypatch.setattr(Settings, "factor", 3.0)
+
+
+def changed_helper(monkeypatch):
+    monkeypatch.setattr(__import__(__name__, fromlist="_"), "helper", tf.abs)
+
+
+LOSS_CHANGES = {
+    "a global": (scaled_loss, changed_global),
+    "an attribute of a class": (loss_by_attribute, changed_attribute),
+    "a function that it calls": (loss_by_helper, changed_helper),
+}
+
+
+def sgd():
+    return keras.optimizers.SGD(0.1)
+
+
+@BOTH_LOOPS
+@pytest.mark.parametrize("change", LOSS_CHANGES)
+def test_train_sees_what_the_loss_reads(make_env, change, monkeypatch):
+    loss, apply = LOSS_CHANGES[change]
+    before = trained(make_env, optimizer=sgd(), loss=loss)
+    np.testing.assert_array_equal(before, trained(make_env, optimizer=sgd(), loss=loss))
+    apply(monkeypatch)
+    assert not np.array_equal(before, trained(make_env, optimizer=sgd(), loss=loss))
+
+
+def fresh(seed=0):
+    return make_networks(4, 2, (8,), seed=seed)
+
+
+@pytest.mark.parametrize("change", LOSS_CHANGES)
+def test_learn_sees_what_the_loss_reads(change, monkeypatch, random_batch):
+    loss, apply = LOSS_CHANGES[change]
+    networks, optimizer, batch = fresh(), sgd(), random_batch(8)
+    learn(batch, 0.9, *networks, optimizer, loss=loss)
+    start, hat = networks[0].get_weights(), networks[1].get_weights()
+    unchanged = learned(batch, networks, optimizer, loss=loss)
+    networks[0].set_weights(start)
+    networks[1].set_weights(hat)
+    apply(monkeypatch)
+    assert not all(map(np.array_equal, unchanged, learned(batch, networks, optimizer, loss=loss)))
+
+
+def set_clipnorm(networks, optimizer):
+    optimizer.clipnorm = 1e-3
+
+
+def set_schedule(networks, optimizer):
+    optimizer.learning_rate = keras.optimizers.schedules.ExponentialDecay(1e-3, 1, 0.5)
+
+
+def set_activation(networks, optimizer):
+    networks[0].layers[0].activation = keras.activations.tanh
+
+
+def set_regularizer(networks, optimizer):
+    networks[0].layers[0].activity_regularizer = keras.regularizers.L2(10.0)
+
+
+def exclude(networks, optimizer):
+    optimizer.exclude_from_weight_decay(var_names=["kernel", "bias"])
+
+
+def set_inner_clipnorm(networks, optimizer):
+    optimizer.inner_optimizer.clipnorm = 1e-3
+
+
+OBJECT_CHANGES = {
+    "clipnorm": (sgd, set_clipnorm),
+    "a learning-rate schedule": (sgd, set_schedule),
+    "an activation": (sgd, set_activation),
+    "a regularizer": (sgd, set_regularizer),
+    "exclusions from weight decay": (lambda: keras.optimizers.AdamW(0.01, weight_decay=5.0), exclude),
+    "an inner optimizer's clipnorm": (lambda: keras.optimizers.LossScaleOptimizer(sgd()), set_inner_clipnorm),
+}
+
+
+@pytest.mark.parametrize("jit_compile", [True, False], ids=["jit", "no jit"])
+@pytest.mark.parametrize("change", OBJECT_CHANGES)
+def test_learn_sees_what_is_set_on_an_optimizer_or_a_layer(change, jit_compile, random_batch):
+    make_optimizer, apply = OBJECT_CHANGES[change]
+    batch, results = random_batch(8), []
+    for changes in (False, True):
+        networks, optimizer = fresh(), make_optimizer()
+        learn(batch, 0.9, *networks, optimizer, jit_compile=jit_compile)
+        if changes:
+            apply(networks, optimizer)
+        results.append(learned(batch, networks, optimizer, jit_compile=jit_compile))
+    assert not all(map(np.array_equal, *results))
+
+
+def test_learn_sees_a_function_put_into_a_lambda_layer_and_a_recurrent_activation(random_batch):
+    def with_lambda():
+        return sequential(dense(8), keras.layers.Lambda(tf.sin))
+
+    def with_gru():
+        cell = keras.layers.GRUCell(4, kernel_initializer="ones", recurrent_initializer="ones")
+        return sequential(keras.layers.Reshape((4, 1)), keras.layers.RNN(cell))
+
+    def change_lambda(network):
+        network.layers[1].function = tf.cos
+
+    def change_gru(network):
+        network.layers[1].cell.recurrent_activation = tf.sin
+
+    for make, change in ((with_lambda, change_lambda), (with_gru, change_gru)):
+        networks, optimizer, batch = (make(), make()), sgd(), random_batch(8)
+        learn(batch, 0.9, *networks, optimizer)
+        change(networks[0])
+        theirs, their_hat = make(), make()
+        theirs.set_weights(networks[0].get_weights())
+        their_hat.set_weights(networks[1].get_weights())
+        change(theirs)
+        value = float(learn(batch, 0.9, *networks, optimizer))
+        assert value == pytest.approx(parts.eager_step(batch, 0.9, 0.01, theirs, their_hat, sgd()), rel=1e-4)
+
+
+@BOTH_LOOPS
+def test_train_sees_a_global_that_an_activation_reads(make_env, monkeypatch):
+    def run():
+        network = sequential(dense(8, bent))
+        return trained(make_env, q_network=network)
+
+    before = run()
+    np.testing.assert_array_equal(before, run())
+    monkeypatch.setattr(__import__(__name__, fromlist="_"), "BENT", 5.0)
+    assert not np.array_equal(before, run())
+
+
+class Drift(FuncEnv):
+    """A number that grows by what the class, the object and an object that it holds say."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gym.spaces.Discrete(2)
+    speed = 1.0
+
+    def __init__(self, offset=0.0, held=None):
+        super().__init__()
+        self.offset, self.held = offset, held or {"bonus": 0.0}
+
+    def initial(self, rng, params=None):
+        return tf.constant(0.0)
+
+    def transition(self, state, action, rng, params=None):
+        return state + self.speed
+
+    def observation(self, state, rng, params=None):
+        return (state + self.offset)[None]
+
+    def reward(self, state, action, next_state, rng, params=None):
+        return 1.0 + self.held["bonus"] + 1 / 2 * 0 + (7 // tf.constant(2, tf.float32)) * 0
+
+    def terminal(self, state, rng, params=None):
+        return state > 8.0
+
+
+def test_train_sees_changes_of_a_functional_environment(monkeypatch):
+    env = Drift()
+
+    def rewards_and_observations():
+        run = train(env, QUICK, seed=0, verbose=0)
+        return run.rewards[0], run.agent.memory.rows[0, 0], run.episodes[0].steps
+
+    assert rewards_and_observations() == (9.0, 0.0, 9)
+    monkeypatch.setattr(Drift, "speed", 2.0)
+    assert rewards_and_observations() == (5.0, 0.0, 5)
+    env.held["bonus"] = 1.0
+    assert rewards_and_observations() == (10.0, 0.0, 5)
+    env.offset = 3.0
+    assert rewards_and_observations() == (10.0, 3.0, 5)
+
+
+class Typed(Drift):
+    """Divides by an attribute, whole or not."""
+
+    step = 2.0
+
+    def transition(self, state, action, rng, params=None):
+        return state + float(7 // self.step if isinstance(self.step, int) else 7 / self.step)
+
+
+def test_a_whole_number_in_the_place_of_an_equal_float_is_another_environment(monkeypatch):
+    steps = [train(Typed(), QUICK, seed=0, verbose=0).episodes[0].steps]
+    monkeypatch.setattr(Typed, "step", 2)
+    steps.append(train(Typed(), QUICK, seed=0, verbose=0).episodes[0].steps)
+    assert steps == [3, 3]  # 3.5 + 3.5 + 3.5, 3 + 3 + 3: both are over 8 in three steps
+    assert train(Typed(), QUICK, seed=0, verbose=0).agent.memory.rows[0, 3 + 1] in (3.0, 0.0)
+
+
+def test_another_gravity_is_seen_in_the_packages_own_cartpole(monkeypatch):
+    before = train(CartPole(), QUICK, seed=0, verbose=0).agent.memory.rows.copy()
+    monkeypatch.setattr(cartpole_module, "GRAVITY", 50.0)
+    assert not np.array_equal(before, train(CartPole(), QUICK, seed=0, verbose=0).agent.memory.rows)
+
+
+# What is not in a configuration is kept
+
+
+def test_normalization_scales_in_acting_learning_and_q_hat():
+    network = NETWORKS["Normalization, adapted"]()
+    far = np.full((1, 4), 1e4, np.float32)
+    plain = keras.Sequential(network.layers[1:])
+    run = train(
+        gym.make("CartPole-v1"), Config(num_episodes=1, max_steps=2, batch_size=2), 0, q_network=network, verbose=0
+    )
+    assert abs(network(far) - plain(far)).numpy().max() > 100
+    np.testing.assert_allclose(run.q_hat_network(far), network(far), rtol=1e-2)
+
+
+def test_exclusions_from_weight_decay_hold_in_train():
+    decaying = [keras.optimizers.AdamW(0.001, weight_decay=100.0) for _ in range(2)]
+    decaying[1].exclude_from_weight_decay(var_names=["kernel", "bias"])
+    norms = [np.linalg.norm(trained(optimizer=x, config=QUICK)) for x in decaying]
+    assert norms[0] < 0.9 * norms[1]
+
+
+def test_an_own_optimizer_without_a_configuration_trains():
+    assert np.isfinite(trained(optimizer=parts.SignDescent(2.0))).all()
+    assert not np.array_equal(trained(optimizer=parts.SignDescent(2.0)), trained(optimizer=parts.SignDescent(0.1)))
+
+
+@BOTH_LOOPS
+def test_own_schedules_and_lambda_layers_train(make_env):
+    network = sequential(dense(8), keras.layers.Lambda(lambda x: tf.sin(x)))
+    assert np.isfinite(
+        trained(make_env, q_network=network, optimizer=keras.optimizers.SGD(parts.HalvingSchedule()))
+    ).all()
+
+
+def test_a_learning_rate_that_is_a_python_function_is_called_once_and_that_is_said():
+    with pytest.warns(UserWarning, match=r"the learning rate of 'sgd.*' is a Python function, .* it stays at 0.03"):
+        trained(optimizer=keras.optimizers.SGD(lambda: 0.03))
+
+
+def test_learn_calls_a_learning_rate_that_is_a_python_function_at_each_step(random_batch):
+    rates = iter([0.1, 0.1, 0.0, 0.0])
+    now = [0.1]
+    networks, optimizer, batch = fresh(), keras.optimizers.SGD(lambda: now[0]), random_batch(8)
+    learn(batch, 0.9, *networks, optimizer)
+    now[0] = 0.0
+    before = networks[0].get_weights()
+    np.testing.assert_array_equal(before[0], learned(batch, networks, optimizer)[0])
+    del rates
+
+
+class Forgetful(keras.layers.Layer):
+    """Its factor is in no configuration, and is no plain attribute."""
+
+    def __init__(self, held=None, **kwargs):
+        super().__init__(**kwargs)
+        self.held = held or Settings()
+
+    def call(self, inputs):
+        return inputs * self.held.factor
+
+    def get_config(self):
+        return {"name": self.name}
+
+
+def test_a_layer_that_a_copy_does_not_equal_is_refused_by_name():
+    held = Settings()
+    held.factor = 7.0
+    network = sequential(dense(8), Forgetful(held, name="forgetful"))
+    with pytest.raises(
+        ValueError, match=r"^q_network cannot be copied for Q-hat: the copy of layer 'forgetful' \(Forgetful\)"
+    ):
+        train(CartPole(), QUICK, q_network=network, verbose=0)
+
+
+def test_a_layer_that_cannot_be_made_again_is_refused_by_name():
+    class Demanding(keras.layers.Layer):
+        def __init__(self, factor):
+            super().__init__(name="demanding")
+            self.factor = factor
+
+        def call(self, inputs):
+            return inputs * self.factor
+
+    with pytest.raises(ValueError, match=r"^q_network cannot be copied for Q-hat: layer 'demanding' .* get_config\(\)"):
+        train(CartPole(), QUICK, q_network=sequential(Demanding(2.0)), verbose=0)
+
+
+# Regularization, loss scaling, inference mode
+
+
+@BOTH_LOOPS
+def test_regularization_is_part_of_the_loss(make_env):
+    norms = []
+    for factor in (0.0, 100.0):
+        regularizer = keras.regularizers.L2(factor)
+        network = sequential(dense(8, "relu", kernel_regularizer=regularizer))
+        run = train(
+            make_env(),
+            QUICK,
+            seed=0,
+            q_network=network,
+            optimizer=sgd() if not factor else keras.optimizers.SGD(1e-3),
+            verbose=0,
+        )
+        norms.append(np.linalg.norm(run.q_network.get_weights()[0]))
+    assert norms[1] < 0.5 * norms[0]
+
+
+def test_one_warning_names_the_layers_that_differ_in_training(cartpole):
+    network = sequential(dense(8, "relu"), keras.layers.Dropout(0.5, name="drop"))
+    with pytest.warns(UserWarning, match=r"q_network is called in inference mode.*: drop \(Dropout\)") as told:
+        train(cartpole, QUICK, seed=0, q_network=network, verbose=0)
+    assert len([w for w in told if "inference mode" in str(w.message)]) == 1
+
+
+@BOTH_LOOPS
+def test_after_a_run_with_ema_the_network_holds_the_averages_as_after_fit(make_env):
+    optimizer = keras.optimizers.SGD(0.1, use_ema=True, ema_momentum=0.99)
+    run = train(make_env(), QUICK, seed=0, optimizer=optimizer, verbose=0)
+    averages = optimizer._model_variables_moving_average
+    for weight, average in zip(run.q_network.trainable_variables, averages, strict=True):
+        np.testing.assert_array_equal(weight, average)
+    plain = train(make_env(), QUICK, seed=0, optimizer=sgd(), verbose=0)
+    assert not np.array_equal(weights_of(plain.q_network), weights_of(run.q_network))
+
+
+# Optimizer, loss and targets: whose, and which
+
+
+@BOTH_LOOPS
+def test_a_compiled_network_brings_its_optimizer_and_loss(make_env):
+    def network():
+        return NETWORKS["dense"]()
+
+    compiled = network()
+    compiled.compile(keras.optimizers.AdamW(3e-4, clipnorm=1), loss="huber")
+    optimizer, config = compiled.optimizer, compiled.get_compile_config()
+    ours = trained(make_env, q_network=compiled)
+    own = trained(make_env, q_network=network(), optimizer=keras.optimizers.AdamW(3e-4, clipnorm=1), loss="huber")
+    np.testing.assert_array_equal(ours, own)
+    assert not np.array_equal(ours, trained(make_env, q_network=network()))
+    assert compiled.optimizer is optimizer
+    assert compiled.loss == "huber"
+    assert compiled.get_compile_config().keys() == config.keys()
+
+
+def test_arguments_win_over_what_a_network_was_compiled_with_and_callbacks_see_the_optimizer_in_use():
+    network, optimizer, seen = NETWORKS["dense"](), sgd(), []
+    network.compile(keras.optimizers.AdamW(3e-4), loss="huber")
+    owners = network.optimizer
+    see = keras.callbacks.LambdaCallback(on_epoch_end=lambda epoch, logs: seen.append(see.model.optimizer))
+    ours = trained(q_network=network, optimizer=optimizer, loss="mae", callbacks=see)
+    assert all(x is optimizer for x in seen)
+    assert network.optimizer is owners
+    np.testing.assert_array_equal(ours, trained(q_network=NETWORKS["dense"](), optimizer=sgd(), loss="mae"))
+
+
+def test_a_network_that_train_compiled_itself_starts_the_next_run_with_a_new_adam():
+    network = NETWORKS["dense"]()
+    train(CartPole(), QUICK, seed=0, q_network=network, verbose=0)
+    start = network.get_weights()
+    first = trained(q_network=network, config=Config(**{**vars(QUICK), "alpha": 0.01}))
+    network.set_weights(start)
+    second = trained(q_network=network, config=Config(**{**vars(QUICK), "alpha": 0.01}))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_alpha_and_an_optimizer_that_say_different_things_are_refused(cartpole):
+    config = Config(alpha=0.01)
+    with pytest.raises(ValueError, match=r"^alpha must be left at its default of 0.001 with an optimizer .*, got 0.01"):
+        train(cartpole, config, optimizer=sgd())
+    network = NETWORKS["dense"]()
+    network.compile("adam", loss="mse")
+    with pytest.raises(ValueError, match=r"^alpha must be left"):
+        train(cartpole, config, q_network=network)
+    train(cartpole, Config(num_episodes=2, alpha=0.01, batch_size=8), optimizer=keras.optimizers.SGD(0.01), verbose=0)
+
+
+def test_parts_of_compile_that_are_not_used_are_named(cartpole):
+    network = NETWORKS["dense"]()
+    network.compile("adam", loss="mse", metrics=["mae"])
+    with pytest.warns(UserWarning, match=r"^metrics of q_network.compile are not used by train"):
+        train(cartpole, QUICK, q_network=network, verbose=0)
+
+
+WRONG = {
+    "an optimizer's name": ({"optimizer": "adam"}, TypeError, r"^optimizer must be a Keras optimizer .*, got 'adam'"),
+    "a loss that Keras does not know": ({"loss": "msee"}, ValueError, r"^loss must be a name that Keras knows.*'msee'"),
+    "a loss that is a number": ({"loss": 1}, TypeError, r"^loss must be a name .*, got 1"),
+    "a class of losses": ({"loss": keras.losses.Huber}, TypeError, r"^loss must be a name"),
+    "targets that are a name": ({"targets": "double"}, TypeError, r"^targets must be a function like td_targets"),
+    "a loss over pairs": (
+        {"loss": lambda y, q: y[:, None] - q},
+        ValueError,
+        r"^loss must return a scalar tensor, or one",
+    ),
+    "a loss that is no tensor": ({"loss": lambda y, q: None}, ValueError, r"^loss must return .*, got None"),
+    "targets for every action": (
+        {"targets": lambda batch, gamma, q, q_hat: q_hat(batch.next_state)},
+        ValueError,
+        r"^targets must return a float32 tensor of shape \[B\].*, got float32 of shape",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_slot_filled_wrongly_is_named_in_both_doors(case, cartpole, random_batch):
+    own, error, message = WRONG[case]
+    with pytest.raises(error, match=message):
+        train(cartpole, QUICK, seed=0, verbose=0, **own)
+    own = {"optimizer": sgd(), **own}
+    with pytest.raises(error, match=message):
+        learn(random_batch(), 0.9, *fresh(), own.pop("optimizer"), **own)
+
+
+def test_an_optimizer_of_another_run_is_refused(cartpole):
+    optimizer = sgd()
+    train(cartpole, QUICK, seed=0, optimizer=optimizer, verbose=0)
+    with pytest.raises(ValueError, match=r"^optimizer must be a new one, or one that was built for this q_network"):
+        train(cartpole, QUICK, seed=0, optimizer=optimizer, verbose=0)
+
+
+# Double DQN
+
+
+@BOTH_LOOPS
+def test_double_targets_are_targets_of_ones_own_that_do_the_same(make_env):
+    def by_hand(experiences, gamma, q_network, q_hat_network):
+        best = tf.one_hot(tf.argmax(q_network(experiences.next_state), axis=1), 2)
+        values = tf.reduce_sum(best * q_hat_network(experiences.next_state), axis=1)
+        return experiences.reward + (1 - experiences.terminal_state) * gamma * values
+
+    config = Config(num_episodes=40, batch_size=8, alpha=0.01, solved_reward=1e6)
+    ours, own, plain = (trained(make_env, config, targets=x) for x in (double_td_targets, by_hand, td_targets))
+    np.testing.assert_allclose(ours, own, atol=1e-4)
+    assert not np.array_equal(ours, plain)
+
+
+def test_no_gradient_flows_through_the_targets(random_batch):
+    def through_q(experiences, gamma, q_network, q_hat_network):
+        return td_targets(experiences, gamma, q_hat_network, q_network)  # Q in the place of Q-hat
+
+    def cut(*arguments):
+        return tf.stop_gradient(through_q(*arguments))
+
+    batch = random_batch(8)
+    results = [learned(batch, fresh(), sgd(), targets=x) for x in (through_q, cut)]
+    assert all(map(np.array_equal, *results))
+
+
+def test_the_logged_td_error_is_of_the_targets_in_use(cartpole):
+    def far(experiences, gamma, q_network, q_hat_network):
+        return td_targets(experiences, gamma, q_network, q_hat_network) + 100.0
+
+    config = Config(num_episodes=3, batch_size=8, max_steps=20, alpha=1e-6)
+    run = train(cartpole, config, seed=0, targets=far, verbose=0)
+    assert 99 < run.history["td_error"][-1] < 102
+
+
+# Networks that cannot be learned with
+
+
+def two_outputs():
+    inputs = keras.Input((4,))
+    return keras.Model(inputs, [dense(2)(inputs), dense(2)(inputs)])
+
+
+def in_float64():
+    return keras.Sequential([keras.Input((4,), dtype="float64"), dense(2, dtype="float64")])
+
+
+REFUSED = {
+    "two outputs": (two_outputs, "must have one output, got 2"),
+    "two inputs": (
+        lambda: keras.Model([a := keras.Input((4,)), b := keras.Input((4,))], dense(2)(a + b)),
+        "must have one input, got 2",
+    ),
+    "float64": (in_float64, "must give float32 values, got float64"),
+    "a sequence of values": (
+        lambda: keras.Sequential([keras.Input((4, 1)), dense(2)]),
+        r"must give Q-values of shape \[B, A\]",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_network_of_another_form_is_refused_in_one_line(case, random_batch, cartpole):
+    make, message = REFUSED[case]
+    with pytest.raises(ValueError, match=f"^q_network {message}"):
+        learn(random_batch(), 0.9, make(), make(), sgd())
+    with pytest.raises(ValueError, match=f"^q_network {message}"):
+        train(cartpole, q_network=make())
+
+
+def test_what_xla_cannot_compile_is_named_with_the_way_out(random_batch):
+    def printing(y, q):
+        tf.raw_ops.PrintV2(input=tf.strings.as_string(y[0]))
+        return tf.reduce_mean(tf.square(y - q))
+
+    with pytest.raises(ValueError, match=r"^jit_compile must be False for this .* XLA cannot compile .*AsString"):
+        learn(random_batch(), 0.9, *fresh(), sgd(), loss=printing)
+
+
+# Numbers compile nothing, equal parts compile once
+
+
+NUMBERS = [
+    {"gamma": 0.9},
+    {"tau": 0.05},
+    {"alpha": 0.01},
+    {"epsilon": 0.5, "decay": 0.9},
+    {"epsilon_min": 0.2},
+    {"solved_reward": 50.0},
+    {"num_episodes": 7},
+    {"max_steps": 9},
+]
+
+
+@BOTH_LOOPS
+def test_another_number_compiles_nothing_and_counts(make_env):
+    first = trained(make_env)
+    num_programs = len(_shared), len(_compiled)
+    for number in NUMBERS:
+        other = trained(make_env, config=Config(**{**vars(QUICK), **number}))
+        assert number.keys() & {"solved_reward", "epsilon_min"} or not np.array_equal(first, other), number
+    np.testing.assert_array_equal(first, trained(make_env))
+    assert (len(_shared), len(_compiled)) == num_programs
+
+
+@BOTH_LOOPS
+def test_runs_with_an_equal_loss_compile_once_and_leave_no_memory_behind(make_env):
+    def run():
+        trained(make_env, loss=lambda y, q: tf.reduce_mean(tf.abs(y - q)))
+        gc.collect()
+        return psutil.Process(os.getpid()).memory_info().rss / 1e6
+
+    for _ in range(3):
+        run()
+    num_compiled, before = len(_compiled), run()
+    for _ in range(6):
+        after = run()
+    assert len(_compiled) == num_compiled
+    assert after - before < 6 * 3  # MB; a program of its own takes about 40 in the compiled loop
+
+
+def test_new_functions_at_each_call_of_learn_are_warned_of(random_batch):
+    networks, optimizer, batch = fresh(), sgd(), random_batch(8)
+
+    def learn_with_a_new_function():
+        learn(batch, 0.9, *networks, optimizer, loss=lambda y, q: tf.reduce_mean(y - q), jit_compile=False)
+
+    for _ in range(7):
+        learn_with_a_new_function()
+    with pytest.warns(UserWarning, match=r"learn was compiled 8 times for 'q_network'"):
+        learn_with_a_new_function()
+
+
+def test_transitions_are_counted_beyond_32_bits():
+    spaces = check_spaces("CartPole", CartPole.observation_space, CartPole.action_space)
+    prints = []
+    for num_before in (50_000, 50_000 * 50_000):  # a full memory, at the same place of its ring
+        agent = make_agent((4,), 2, QUICK, 0)
+        agent.memory.rows[:] = np.random.default_rng(0).normal(size=agent.memory.rows.shape)
+        agent.memory.rows[:, 8] = agent.memory.rows[:, 10] = 0
+        agent.memory.num_appended = num_before
+        played = list(episodes(CartPole(), spaces, agent, QUICK))
+        assert agent.memory.num_appended == num_before + sum(e.steps for e in played)
+        prints.append(weights_of(agent.q_network, agent.q_hat_network))
+        assert agent.num_updates > 0
+    np.testing.assert_array_equal(*prints)
+
+
+# What a checkpoint knows them by
+
+
+def doubled(scale, y, q):
+    return scale * tf.reduce_mean(tf.square(y - q))
+
+
+def own_targets(experiences, gamma, q_network, q_hat_network):
+    return td_targets(experiences, gamma, q_network, q_hat_network)
+
+
+def test_functions_without_a_name_are_refused_for_a_checkpoint(tmp_path, cartpole):
+    def local(y, q):
+        return tf.reduce_mean(tf.square(y - q))
+
+    for own in (
+        {"loss": lambda y, q: tf.reduce_mean(tf.square(y - q))},
+        {"loss": local},
+        {"loss": functools.partial(local)},
+        {"targets": lambda *arguments: td_targets(*arguments)},
+        {"q_network": sequential(dense(8, lambda x: tf.sin(x)))},
+        {"optimizer": keras.optimizers.SGD(lambda: 0.1)},
+    ):
+        (name,) = own
+        with pytest.raises(ValueError, match=rf"^{name} must have a name that can be imported, .*`def`"):
+            train(cartpole, QUICK, seed=0, checkpoint=tmp_path / "run", verbose=0, **own)
+    assert not (tmp_path / "run").exists()
+
+
+SAME_OR_NOT = {
+    "loss": [
+        "huber",
+        "mse",
+        scaled_loss,
+        keras.losses.Huber(0.5),
+        keras.losses.Huber(2.0),
+        functools.partial(doubled, 1.0),
+        functools.partial(doubled, 2.0),
+    ],
+    "targets": [td_targets, double_td_targets, own_targets],
+    "optimizer": [
+        lambda: keras.optimizers.SGD(0.1),
+        lambda: keras.optimizers.SGD(0.2),
+        lambda: keras.optimizers.SGD(0.1, clipnorm=1.0),
+        lambda: keras.optimizers.Adam(keras.optimizers.schedules.ExponentialDecay(0.1, 1, 0.5)),
+        lambda: keras.optimizers.Adam(keras.optimizers.schedules.ExponentialDecay(0.1, 1, 0.6)),
+        lambda: keras.optimizers.Adam(parts.HalvingSchedule()),
+        lambda: parts.SignDescent(1.0),
+        lambda: parts.SignDescent(2.0),
+        lambda: keras.optimizers.AdamW(0.1),
+        parts.excluding,
+    ],
+    "q_network": [
+        NETWORKS["dense"],
+        NETWORKS["Normalization, adapted"],
+        NETWORKS["Normalization, given"],
+        NETWORKS["an activation of one's own"],
+        NETWORKS["a layer with an attribute set later"],
+        lambda: sequential(dense(8, "relu"), parts.Scaled()),
+    ],
+}
+
+
+@pytest.mark.parametrize("slot", SAME_OR_NOT)
+def test_a_run_is_resumed_with_the_same_parts_and_with_no_others(slot, tmp_path, cartpole):
+    def go_on(part, folder, resume=True):
+        own = part() if slot in ("optimizer", "q_network") else part
+        return train(cartpole, QUICK, seed=0, checkpoint=folder, resume=resume, verbose=0, **{slot: own})
+
+    choices = SAME_OR_NOT[slot]
+    for i, part in enumerate(choices):
+        go_on(part, tmp_path / str(i), resume=False)
+        go_on(part, tmp_path / str(i))
+        with pytest.raises(ValueError, match=rf"^{slot} is "):
+            go_on(choices[i - 1], tmp_path / str(i))
+
+
+def test_another_source_under_the_same_name_is_noticed(tmp_path, cartpole, monkeypatch):
+    module = __import__(__name__, fromlist="_")
+    train(cartpole, QUICK, seed=0, loss=scaled_loss, checkpoint=tmp_path, verbose=0)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "FACTOR", 100.0)
+        with pytest.raises(ValueError, match=r'^loss is .*"FACTOR": 1.0.*, got .*"FACTOR": 100.0'):
+            train(cartpole, QUICK, seed=0, loss=scaled_loss, checkpoint=tmp_path, resume=True, verbose=0)
+
+    def scaled_again(y, q):
+        return 100.0 * tf.reduce_mean(tf.square(y - q))
+
+    scaled_again.__qualname__ = "scaled_loss"
+    monkeypatch.setattr(module, "scaled_loss", scaled_again)
+    with pytest.raises(ValueError, match=r"^loss is "):
+        train(cartpole, QUICK, seed=0, loss=scaled_again, checkpoint=tmp_path, resume=True, verbose=0)
+
+
+@BOTH_LOOPS
+def test_a_run_with_own_parts_is_resumed_bit_for_bit(make_env, tmp_path):
+    def run(num_episodes, **more):
+        config = Config(num_episodes=num_episodes, batch_size=8, solved_reward=1e6)
+        optimizer = keras.optimizers.AdamW(
+            keras.optimizers.schedules.ExponentialDecay(0.01, 10, 0.9), use_ema=True, ema_overwrite_frequency=7
+        )
+        own = {"q_network": NETWORKS["Normalization, adapted"](), "optimizer": optimizer, "targets": own_targets}
+        return trained(make_env, config=config, loss=keras.losses.Huber(), **own, **more)
+
+    whole = run(12)
+    run(5, checkpoint=tmp_path)
+    np.testing.assert_array_equal(whole, run(12, checkpoint=tmp_path, resume=True))
