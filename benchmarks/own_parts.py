@@ -1,13 +1,14 @@
-"""What other numbers and parts of one's own cost beside the training: CPU seconds and memory.
+"""What other numbers and parts of your own cost beside the training: CPU seconds and memory.
 
     python -m benchmarks.own_parts > results/own_parts.md
 
-Each row is a process of its own, on one core. In it `train` runs several times, each run with something new. A run with
-a part of one's own comes after one with the defaults, so that what the package compiles for itself is not counted. The
-seconds are a run's CPU time less that of the same Config with default parts, run right after it, when nothing of that is
-left to compile. Memory is what the process holds, after Python's garbage collector.
+Each row is a process of its own, on one core, that calls `train` several times, each time with something new. Rows with
+own parts begin with a run with the defaults, which is not counted. The seconds are a run's CPU time less that of a run
+of the same Config with the default parts, made right after it, when those need no compilation. Memory is the process's
+resident memory, after Python's garbage collector, and after glibc has returned what it does not use.
 """
 
+import ctypes
 import gc
 import importlib.metadata
 import json
@@ -47,28 +48,22 @@ LOSSES = [
 
 
 def new_parts() -> dict[str, Any]:
-    """A network, an optimizer and targets; made anew, the program for them is the same."""
-    layers = [keras.Input((4,)), keras.layers.Dense(64, "tanh"), keras.layers.Dense(2)]
+    """A network, an optimizer and targets: new objects at each call, that compute the same."""
+    layers = [keras.Input((4,)), keras.layers.Dense(64, "relu"), keras.layers.Dense(2)]
     optimizer = keras.optimizers.AdamW(0.001, global_clipnorm=10)
     return {"q_network": keras.Sequential(layers), "optimizer": optimizer, "targets": double_td_targets}
 
 
 SERIES: dict[str, Callable[[], Iterator[tuple[Config, dict]]]] = {
-    "six Configs: another gamma, tau, alpha, decay, solved_reward": lambda: ((config, {}) for config in CONFIGS),
-    "twelve lambdas as loss, of one formula": lambda: (
-        (CONFIG, {"loss": lambda y, q: tf.square(y - q)}) for _ in range(12)
-    ),
-    "twelve times a new network, AdamW, double targets": lambda: ((CONFIG, new_parts()) for _ in range(12)),
-    "six losses, of six formulas": lambda: ((CONFIG, {"loss": loss}) for loss in LOSSES),
+    "six Configs": lambda: ((config, {}) for config in CONFIGS),
+    "one loss, twelve times": lambda: ((CONFIG, {"loss": lambda y, q: tf.square(y - q)}) for _ in range(12)),
+    "new parts, twelve times": lambda: ((CONFIG, new_parts()) for _ in range(12)),
+    "six losses": lambda: ((CONFIG, {"loss": loss}) for loss in LOSSES),
 }
 
 
-def measure(make_env: Callable, config: Config, parts: dict[str, Any]) -> tuple[float, float]:
-    """CPU seconds beyond the training of one run, and by how many megabytes the process has grown."""
-    before = megabytes()
-    seconds = cpu_seconds(make_env, config, parts)
-    grown = megabytes() - before
-    return seconds - cpu_seconds(make_env, config, {}), grown
+def seconds_beyond_training(make_env: Callable, config: Config, parts: dict[str, Any]) -> float:
+    return cpu_seconds(make_env, config, parts) - cpu_seconds(make_env, config, {})
 
 
 def cpu_seconds(make_env: Callable, config: Config, parts: dict[str, Any]) -> float:
@@ -79,15 +74,34 @@ def cpu_seconds(make_env: Callable, config: Config, parts: dict[str, Any]) -> fl
 
 def megabytes() -> float:
     gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)  # glibc gives back what it keeps for later
     with open("/proc/self/statm") as file:  # Linux
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def run_series(loop: str, name: str) -> list[tuple[float, float]]:
-    make_env, are_own = ENVIRONMENTS[loop], SERIES[name] is not next(iter(SERIES.values()))
-    if are_own:
+def run_series(loop: str, name: str) -> dict[str, list[float]]:
+    """Of each run the seconds, and what the process holds before the first and after each."""
+    make_env = ENVIRONMENTS[loop]
+    if name != "six Configs":
         cpu_seconds(make_env, CONFIG, {})
-    return [measure(make_env, config, parts) for config, parts in SERIES[name]()]
+    seconds, held = [], [megabytes()]
+    for config, parts in SERIES[name]():
+        seconds.append(seconds_beyond_training(make_env, config, parts))
+        held.append(megabytes())
+    return {"seconds": seconds, "megabytes": held}
+
+
+def print_row(loop: str, name: str, seconds: list[float], megabytes: list[float]) -> None:
+    first, *later = [round(x, 2) + 0.0 for x in seconds]
+    cells = [
+        loop,
+        name,
+        f"{first:.2f}",
+        f"{megabytes[1] - megabytes[0]:.0f}",
+        f"{statistics.median(later):.2f} ({min(later):.2f} to {max(later):.2f})",
+        f"{(megabytes[-1] - megabytes[1]) / len(later):.1f}",
+    ]
+    print(f"| {' | '.join(cells)} |", flush=True)
 
 
 def main() -> None:
@@ -96,22 +110,21 @@ def main() -> None:
         return
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # Linux; the processes inherit it
     versions = [f"{p} {importlib.metadata.version(p)}" for p in ("tensorflow", "keras", "gymnasium", "numpy")]
-    print("# What other numbers and your own parts cost\n")
-    print("`python -m benchmarks.own_parts`: runs of 100 episodes, one after the other, a process for each row, one core.")
-    print("CPU seconds beyond training, and memory that stays. The first run compiles; what do the later ones cost?")
+    print("# What your own parts cost\n")
+    print("`python -m benchmarks.own_parts`: each row is a process, on one core, that calls `train` several times, 100")
+    print("episodes of CartPole each. Seconds are CPU time beyond the training; memory is what the process keeps.")
     print(f"Python {platform.python_version()}, {', '.join(versions)}.\n")
-    print("| loop | runs | first, s | MB | later, s: median (highest) | MB of all the later |")
+    print("| loop | runs | first run, s | it keeps, MB | a later run, s: median (range) | it keeps, MB (mean) |")
     print("|---|---|---|---|---|---|")
     for loop in ENVIRONMENTS:
         for name in SERIES:
-            done = subprocess.run(
-                [sys.executable, "-m", "benchmarks.own_parts", loop, name], capture_output=True, text=True, check=True
-            )
-            (first, first_megabytes), *later = json.loads(done.stdout)
-            seconds, grown = zip(*later, strict=True)
-            median, highest = statistics.median(seconds), max(seconds)
-            row = [loop, name, f"{first:.2f}", f"{first_megabytes:.0f}", f"{median:.2f} ({highest:.2f})"]
-            print(f"| {' | '.join(row)} | {sum(grown):.0f} |", flush=True)
+            command = [sys.executable, "-m", "benchmarks.own_parts", loop, name]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            print_row(loop, name, **json.loads(done.stdout))
+    print("""
+Six Configs: they differ in gamma, tau, alpha, decay and solved_reward; the first run compiles what all of them use. One
+loss: a new lambda for each run, of the same formula. New parts: a new network, AdamW and double targets for each run,
+alike. Six losses: six formulas. Before the rows of own parts there is a run with the defaults.""")
 
 
 if __name__ == "__main__":

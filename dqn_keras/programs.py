@@ -11,8 +11,6 @@ import re
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from tensorflow.python.framework import ops
-
 from dqn_keras._tensorflow import keras, require_xla, tf
 from dqn_keras.graphs import fingerprint
 from dqn_keras.networks import make_q_network, units_if_made_here
@@ -233,7 +231,12 @@ def _custom_gradients_forgotten() -> Iterator[None]:
 
     They are there to differentiate a function once more, which nobody does with a program.
     """
-    registry = ops.gradient_registry._registry
+    try:
+        from tensorflow.python.framework.ops import gradient_registry
+
+        registry = gradient_registry._registry
+    except (ImportError, AttributeError):  # another TensorFlow; then they stay
+        registry = {}
     before = set(registry)
     try:
         yield
