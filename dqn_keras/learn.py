@@ -78,12 +78,9 @@ def loss_values(experiences: Experience, gamma: Any, q_network: keras.Model, q_h
 
     Arguments and errors are those of `td_targets`, which gives y.
     """
-    y_targets = td_targets(experiences, gamma, q_network, q_hat_network)
-    return keras.losses.mean_squared_error(y_targets, _values_of_actions(q_network(experiences.state), experiences))
-
-
-def _values_of_actions(q_values: tf.Tensor, experiences: Experience) -> tf.Tensor:
-    return tf.gather(q_values, experiences.action, batch_dims=1)  # [B, A], [B] -> [B]
+    y_targets = td_targets(experiences, gamma, q_network, q_hat_network)  # [B]
+    q_values = tf.gather(q_network(experiences.state), experiences.action, batch_dims=1)  # [B]
+    return keras.losses.mean_squared_error(y_targets, q_values)
 
 
 def update_q_hat(q_network: keras.Model, q_hat_network: keras.Model, tau: Any = 0.01) -> None:
@@ -182,7 +179,7 @@ def gradient_step(
     y = formulas.y(experiences, gamma, q_network, q_hat_network)  # [B]
     with tf.GradientTape() as tape:
         q_values = q_network(experiences.state)  # [B, A]
-        q = _values_of_actions(q_values, experiences)  # [B]
+        q = tf.gather(q_values, experiences.action, batch_dims=1)  # [B]
         loss = formulas.loss_of(y, q)
         for regularization in q_network.losses:
             loss += tf.cast(regularization, tf.float32)

@@ -38,7 +38,7 @@ from dqn_keras import (
     make_q_network,
     plot_rewards,
     record_episode,
-    td_errors,
+    td_targets,
     train,
     update_q_hat,
 )
@@ -135,10 +135,11 @@ source(Experience)
 # $$y = \begin{cases} r & s' \text{ terminal} \\ r + \gamma \max_{a'} \hat Q(s', a') & \text{otherwise} \end{cases}
 # \qquad\qquad L(\theta) = \frac{1}{B} \sum_{i=1}^{B} \bigl(y_i - Q(s_i, a_i; \theta)\bigr)^2$$
 #
-# $y - Q(s, a)$ is the *temporal-difference error*: how much better or worse it went than $Q$ had thought.
+# $y - Q(s, a)$ is the *temporal-difference error*: how much better or worse it went than $Q$ had thought. The two
+# functions below take a batch of transitions; `@_takes_a_batch` checks its shapes.
 
 # %%
-source(td_errors, loss_values)
+source(td_targets, loss_values)
 
 # %% [markdown]
 # Two transitions that differ only in their end. Where the episode went on, the target is $1 + 0.95 \max_{a'} \hat Q$;
@@ -165,9 +166,11 @@ source(update_q_hat)
 # %% [markdown]
 # ## One learning step
 #
-# The gradient of the loss with respect to $Q$'s weights alone ($\hat Q$ is held fixed), a step of Adam, the soft
-# update. `learn` is this function compiled by `tf.function`. The networks are its arguments, so that no cell can go on
-# training networks that another cell has replaced.
+# The gradient of the loss with respect to $Q$'s weights alone (the targets $y$ are held fixed), a step of Adam, the
+# soft update. `formulas` holds the targets and the loss, here `td_targets` and the mean squared error; the lines about
+# regularization and scaling do nothing for the network and the optimizer of this lesson. `learn` is this function
+# compiled by `tf.function`. The networks are its arguments, so that no cell can go on training networks that another
+# cell has replaced.
 
 # %%
 source(gradient_step)
