@@ -15,9 +15,11 @@ import tensorflow as tf
 
 from dqn_keras import Config
 from dqn_keras.agent import make_agent
-from dqn_keras.compiled_loop import check_functional, draw_bits, episodes, sample_indices
+from dqn_keras.checks.environments import check_functional
 from dqn_keras.environments import CartPole
 from dqn_keras.learn import gradient_step, loss_values
+from dqn_keras.loops.compiled import episodes
+from dqn_keras.loops.draws import draw_bits, sample_indices
 from dqn_keras.replay import unpack
 
 CONFIG = Config(epsilon=0.1, num_episodes=10**6)

@@ -20,7 +20,7 @@ from pathlib import Path
 import gymnasium as gym
 
 from dqn_keras import Config, train
-from dqn_keras._tensorflow import keras
+from dqn_keras._engine.tensorflow import keras
 from dqn_keras.environments import CartPole
 
 

@@ -24,7 +24,7 @@ from typing import Any
 import gymnasium as gym
 
 from dqn_keras import Config, double_td_targets, train
-from dqn_keras._tensorflow import keras, tf
+from dqn_keras._engine.tensorflow import keras, tf
 from dqn_keras.environments import CartPole
 
 ENVIRONMENTS = {"Gymnasium": lambda: gym.make("CartPole-v1"), "compiled": CartPole}
@@ -99,7 +99,7 @@ def print_row(loop: str, name: str, seconds: list[float], megabytes: list[float]
         f"{first:.2f}",
         f"{megabytes[1] - megabytes[0]:.0f}",
         f"{statistics.median(later):.2f} ({min(later):.2f} to {max(later):.2f})",
-        f"{(megabytes[-1] - megabytes[1]) / len(later):.1f}",
+        f"{round((megabytes[-1] - megabytes[1]) / len(later), 1) + 0.0:.1f}",
     ]
     print(f"| {' | '.join(cells)} |", flush=True)
 

@@ -19,12 +19,14 @@ import numpy as np
 import tensorflow as tf
 from hypothesis import HealthCheck, given, settings
 
-from dqn_keras import Config, compiled_loop, diagnostics, train
+from dqn_keras import Config, train
+from dqn_keras import metrics as metrics_module
+from dqn_keras._engine.programs import _shared
 from dqn_keras.agent import make_agent
-from dqn_keras.checkpoint import Checkpoints
-from dqn_keras.environment import CheckedEnv
+from dqn_keras.checks.environments import CheckedEnv, check_functional
 from dqn_keras.environments import CartPole
-from dqn_keras.programs import _shared
+from dqn_keras.loops import compiled
+from dqn_keras.storage.checkpoint import Checkpoints
 from tests import faults
 from tests.test_config import bad_fields, refused
 
@@ -96,17 +98,17 @@ def cost_of_checks() -> dict[str, str]:
 
 def cost_of_compiled_checks(rounds: int = 30) -> dict[str, str]:
     """The same for compiled episodes: their program with and without the checks, in turn."""
-    checks, config = compiled_loop.is_all_finite, Config(num_episodes=10**6, epsilon=0.1, solved_reward=1e6)
+    checks, config = compiled.is_all_finite, Config(num_episodes=10**6, epsilon=0.1, solved_reward=1e6)
     loops = []
     for is_all_finite in (checks, lambda *_: tf.constant(True)):
-        compiled_loop.is_all_finite = diagnostics.is_all_finite = is_all_finite
+        compiled.is_all_finite = metrics_module.is_all_finite = is_all_finite
         _shared.clear()
         agent = make_agent((4,), 2, config, 0)
-        loop = compiled_loop.episodes(CartPole(), compiled_loop.check_functional(CartPole()), agent, config)
+        loop = compiled.episodes(CartPole(), check_functional(CartPole()), agent, config)
         while agent.memory.num_appended < 60_000:
             next(loop)
         loops.append((agent, loop))
-    compiled_loop.is_all_finite = diagnostics.is_all_finite = checks
+    compiled.is_all_finite = metrics_module.is_all_finite = checks
     costs = []
     for _ in range(rounds):
         turns = []

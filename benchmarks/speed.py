@@ -23,12 +23,12 @@ from collections.abc import Callable
 import gymnasium as gym
 
 from dqn_keras import Config
-from dqn_keras.agent import episode_seed, make_agent
-from dqn_keras.compiled_loop import check_functional
-from dqn_keras.compiled_loop import episodes as compiled_loop_episodes
-from dqn_keras.environment import CheckedEnv
+from dqn_keras.agent import make_agent
+from dqn_keras.checks.environments import CheckedEnv, check_functional
 from dqn_keras.environments import CartPole
-from dqn_keras.gymnasium_loop import episodes
+from dqn_keras.loops.compiled import episodes as compiled_loop_episodes
+from dqn_keras.loops.gymnasium import episodes
+from dqn_keras.seeding import episode_seed
 from tests import original_algorithm
 
 CONFIG = Config(epsilon=0.1, epsilon_min=0.1, num_episodes=10**9 // 1000)

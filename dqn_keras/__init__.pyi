@@ -1,8 +1,5 @@
 from . import environments as environments
 from .agent import Agent as Agent
-from .agent import Episode as Episode
-from .agent import episode_seed as episode_seed
-from .checkpoint import load_agent as load_agent
 from .config import Config as Config
 from .evaluation import evaluate as evaluate
 from .learn import double_td_targets as double_td_targets
@@ -10,6 +7,7 @@ from .learn import learn as learn
 from .learn import loss_values as loss_values
 from .learn import td_targets as td_targets
 from .learn import update_q_hat as update_q_hat
+from .metrics import Episode as Episode
 from .networks import make_networks as make_networks
 from .networks import make_q_network as make_q_network
 from .plotting import plot_rewards as plot_rewards
@@ -22,11 +20,13 @@ from .rendering import record_episode as record_episode
 from .rendering import save_animation as save_animation
 from .replay import Experience as Experience
 from .replay import ReplayMemory as ReplayMemory
+from .seeding import episode_seed as episode_seed
+from .statistics import compare as compare
+from .statistics import summarize as summarize
+from .storage.networks import load_agent as load_agent
 from .study import Study as Study
-from .study import compare as compare
 from .study import load_study as load_study
 from .study import study as study
-from .study import summarize as summarize
 from .training import Run as Run
 from .training import train as train
 from .version import __version__ as __version__

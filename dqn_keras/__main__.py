@@ -2,6 +2,6 @@
 
 import sys
 
-from dqn_keras.cli import main
+from dqn_keras.cli.options import main
 
 sys.exit(main())

@@ -4,15 +4,18 @@ import contextlib
 import dataclasses
 import weakref
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from dqn_keras._tensorflow import keras
-from dqn_keras.config import Config, count
-from dqn_keras.networks import copy, make_networks, renew_weights
-from dqn_keras.programs import Learner
+from dqn_keras._engine.copies import copy
+from dqn_keras._engine.programs import Learner
+from dqn_keras._engine.tensorflow import keras
+from dqn_keras.config import Config
+from dqn_keras.metrics import Episode
+from dqn_keras.networks import make_networks, renew_weights
 from dqn_keras.replay import ReplayMemory
+from dqn_keras.seeding import _derived
 
 
 @dataclasses.dataclass
@@ -37,30 +40,6 @@ class Agent:
     def learner(self) -> Learner:
         """What a gradient step changes."""
         return Learner(self.q_network, self.q_hat_network, self.optimizer)
-
-
-class Episode(NamedTuple):
-    """What happened in one episode."""
-
-    number: int
-    """Counted from 0."""
-    reward: float
-    """Sum of its rewards, undiscounted."""
-    steps: int
-    epsilon: float
-    """With which it was played."""
-    loss: float
-    """Mean over its updates, as are the next three but for max_q; NaN if it had none."""
-    mean_q: float
-    """Mean over a batch of max_a Q(s, a)."""
-    max_q: float
-    """The highest Q-value in any of its batches."""
-    td_error: float
-    """Mean over a batch of |y - Q(s, a)|."""
-    max_reward: float
-    """The highest of one step."""
-    terminated: bool
-    """Whether the environment ended it, not time."""
 
 
 class DivergedError(ValueError):
@@ -155,30 +134,3 @@ def _renew(learner: Learner, config: Config, seed: int) -> None:
     for variable in learner.optimizer.variables:
         variable.assign(np.zeros(variable.shape, variable.dtype))
     learner.optimizer.learning_rate = config.alpha
-
-
-def episode_seed(seed: int, episode: int) -> int:
-    """The seed of `env.reset` for one episode of a run, so that any episode can be begun again exactly."""
-    return int(_derived(seed, 2, episode).generate_state(1)[0])
-
-
-def evaluation_seed(seed: int, episode: int) -> int:
-    """The same for an episode of `evaluate`, which so starts where no episode of `train` did."""
-    return int(_derived(seed, 3, episode).generate_state(1)[0])
-
-
-def draws_key(seed: int) -> np.int64:
-    """The number that all draws of a compiled run follow from."""
-    return _derived(seed, 4).generate_state(1, np.uint64).view(np.int64)[0]
-
-
-def checked_seed(seed: int | None) -> int:
-    """`seed` as an int; a fresh random one for None."""
-    if seed is None:
-        return int(np.random.SeedSequence().generate_state(1)[0] >> 1)
-    return count("seed", seed, at_least=0)
-
-
-def _derived(seed: int, *key: int) -> np.random.SeedSequence:
-    """One of the independent streams that belong to `seed`."""
-    return np.random.SeedSequence(seed, spawn_key=key)

@@ -3,11 +3,12 @@
 import gymnasium as gym
 import numpy as np
 
-from dqn_keras._tensorflow import keras
-from dqn_keras.agent import checked_seed, evaluation_seed
-from dqn_keras.config import count
-from dqn_keras.environment import CheckedEnv
-from dqn_keras.networks import check_fits, q_function
+from dqn_keras._engine.numpy_acting import q_function
+from dqn_keras._engine.tensorflow import keras
+from dqn_keras.checks.environments import CheckedEnv
+from dqn_keras.checks.networks import check_fits
+from dqn_keras.checks.numbers import check_count
+from dqn_keras.seeding import checked_seed, evaluation_seed
 
 
 def evaluate(
@@ -28,8 +29,8 @@ def evaluate(
     checked_env = CheckedEnv(env)
     check_fits(q_network, checked_env.spaces.state_shape, checked_env.spaces.num_actions)
     num_episodes, max_steps, seed = (
-        count("num_episodes", num_episodes),
-        count("max_steps", max_steps),
+        check_count("num_episodes", num_episodes),
+        check_count("max_steps", max_steps),
         checked_seed(seed),
     )
     q_values = q_function(q_network)

@@ -6,7 +6,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from dqn_keras.config import Config, count
+from dqn_keras.checks.numbers import check_count
+from dqn_keras.config import Config
 from dqn_keras.study import Study
 from dqn_keras.training import Run
 
@@ -19,7 +20,7 @@ def plot_rewards(rewards: Sequence[float] | np.ndarray, ax: Axes | None = None, 
         ax: where to draw; by default a new figure of 10 by 5 inches.
         window: episodes in the moving average.
     """
-    window = count("window", window)
+    window = check_count("window", window)
     rewards = np.asarray(rewards, np.float64)
     if rewards.ndim != 1:
         raise ValueError(f"rewards must have one axis, got shape {rewards.shape}")

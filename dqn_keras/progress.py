@@ -1,10 +1,52 @@
-"""The progress bar, in a terminal or in a notebook."""
+"""What a run prints, and its progress bar, in a terminal or in a notebook."""
 
 import warnings
+from typing import TYPE_CHECKING
 
+import numpy as np
 from tqdm import TqdmWarning
+
+from dqn_keras.metrics import Episode
+
+if TYPE_CHECKING:
+    from dqn_keras.training import Run
 
 with warnings.catch_warnings(action="ignore", category=TqdmWarning):  # without ipywidgets a notebook's bar is text
     from tqdm.auto import tqdm
 
-__all__ = ["tqdm"]
+
+__all__ = ["Progress", "tqdm"]
+
+
+class Progress:
+    """The lines that the original prints, and from `verbose` 2 on a bar beside them."""
+
+    def __init__(self, run: "Run", verbose: int) -> None:
+        self._run, self._verbose = run, verbose
+        num_episodes = run.config.num_episodes
+        self._bar = tqdm(total=num_episodes, initial=len(run.episodes), unit="episode", disable=verbose < 2)
+
+    def __enter__(self) -> "Progress":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def show(self, episode: Episode) -> None:
+        """Moves the bar; every 100 episodes a line with the last reward and the average of the last 100."""
+        self._bar.update()
+        if self._verbose and episode.number % 100 == 0:
+            last = [e.reward for e in self._run.episodes[max(0, episode.number - 99) : episode.number + 1]]
+            say = self._bar.write if self._verbose == 2 else print
+            average = round(float(np.mean(last)), 2)
+            say(f"Episode {episode.number}, Reward: {episode.reward}, Last 100 Average: {average}")
+
+    def show_end(self, folder: object | None) -> None:
+        """Whether the run is solved, or was interrupted, and where it is kept."""
+        run = self._run
+        if self._verbose and run.solved_at is not None:
+            average = round(float(np.mean(run.rewards[-run.config.solved_window :])), 2)
+            print(f"Solved with {average} reward in {run.solved_at} episodes!")
+        elif self._verbose and run.interrupted:
+            kept = f", kept in {folder}" if folder else ""
+            print(f"Interrupted after {len(run.episodes)} episodes{kept}")

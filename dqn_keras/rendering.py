@@ -9,11 +9,12 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image
 
-from dqn_keras._tensorflow import keras
-from dqn_keras.agent import checked_seed, evaluation_seed
-from dqn_keras.config import count
-from dqn_keras.environment import CheckedEnv
-from dqn_keras.networks import check_fits, q_function
+from dqn_keras._engine.numpy_acting import q_function
+from dqn_keras._engine.tensorflow import keras
+from dqn_keras.checks.environments import CheckedEnv
+from dqn_keras.checks.networks import check_fits
+from dqn_keras.checks.numbers import check_count
+from dqn_keras.seeding import checked_seed, evaluation_seed
 
 if TYPE_CHECKING:
     import IPython.display
@@ -34,7 +35,7 @@ def record_episode(
     q_values = q_function(q_network)
     state = checked_env.reset(evaluation_seed(checked_seed(seed), 0), episode=0)
     frames = [np.asarray(env.render())]
-    for _ in range(count("max_steps", max_steps)):
+    for _ in range(check_count("max_steps", max_steps)):
         state, _, terminated, truncated = checked_env.step(int(q_values(state).argmax()))
         frames.append(np.asarray(env.render()))
         if terminated or truncated:
@@ -60,7 +61,7 @@ def save_animation(
     """
     if not len(frames):
         raise ValueError("frames must hold at least one frame, got none")
-    fps, width = count("fps", fps), count("width", width)
+    fps, width = check_count("fps", fps), check_count("width", width)
     for frame in frames:
         if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
             raise ValueError(f"frames must be [H, W, 3] uint8, got {frame.shape} {frame.dtype}")

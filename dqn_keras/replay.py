@@ -5,13 +5,12 @@ draw from at random gives those, and lets one transition be learned from more th
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dqn_keras._tensorflow import tf
-from dqn_keras.config import count, counts, number
+from dqn_keras._engine.tensorflow import tf
+from dqn_keras.checks.numbers import check_count, check_counts
 
 
 class Experience(NamedTuple):
@@ -41,7 +40,10 @@ class ReplayMemory:
     """
 
     def __init__(self, memory_size: int, state_shape: tuple[int, ...], dtype: Any = np.float32) -> None:
-        memory_size, self.state_shape = count("memory_size", memory_size), counts("state_shape", state_shape)
+        memory_size, self.state_shape = (
+            check_count("memory_size", memory_size),
+            check_counts("state_shape", state_shape),
+        )
         if dtype not in (np.float32, np.uint8):
             raise ValueError(f"dtype must be float32 or uint8, got {dtype!r}")
         size = math.prod(self.state_shape)
@@ -103,57 +105,3 @@ def pack(experience: Experience) -> tf.Tensor:
     if state.dtype != tf.float32:
         scalars = tf.bitcast(scalars, state.dtype)  # [3, 4]
     return tf.concat([tf.reshape(x, [-1]) for x in (state, next_state, scalars)], axis=0)
-
-
-def as_batch(experiences: Sequence[Any], state_shape: tuple[int, ...], num_actions: int) -> Experience:
-    """Any five arrays as tensors of the right dtypes; an error that names the field if one cannot be that.
-
-    A reward of shape [B, 1] would otherwise broadcast against [B] to a loss over [B, B], without a word. Values are
-    checked where there are any: inside a tf.function there are not.
-    """
-    if len(experiences) != len(_PLURALS):
-        raise ValueError(f"experiences must be the five fields {', '.join(_PLURALS)}, got {len(experiences)}")
-    fields = []
-    for name, field in zip(_PLURALS, experiences, strict=True):
-        try:
-            fields.append(field if tf.is_tensor(field) else np.asarray(field))
-        except ValueError as error:
-            raise ValueError(f"{name} must be an array: {error}") from None
-    num_transitions = fields[0].shape[0] if len(fields[0].shape) else None
-    if num_transitions == 0:
-        raise ValueError("states must hold at least one transition, got none")
-    vector, states = [num_transitions], [num_transitions, *state_shape]
-    shapes = [states, vector, vector, states, vector]
-    return Experience(*(_checked(*x, num_actions) for x in zip(_PLURALS, fields, shapes, strict=True)))
-
-
-def _checked(name: str, field: Any, shape: list, num_actions: int) -> tf.Tensor:
-    got = tf.TensorShape(field.shape)
-    if got.rank != len(shape) or not got.is_compatible_with(shape):
-        raise ValueError(f"{name} must have shape {shape}, got {got}")
-    dtype = tf.as_dtype(field.dtype) if field.dtype != object else tf.string
-    if not (dtype.is_integer or (name != "actions" and (dtype.is_floating or dtype.is_bool))):
-        raise ValueError(f"{name} must be {'whole numbers' if name == 'actions' else 'numbers'}, got {dtype.name}")
-    if not tf.is_tensor(field) or (tf.executing_eagerly() and hasattr(field, "numpy")):
-        field = np.asarray(field)
-        if name == "actions" and not (field.min() >= 0 and field.max() < num_actions):  # XLA would clamp it
-            raise ValueError(f"actions must lie in 0..{num_actions - 1}, got {field.min()}..{field.max()}")
-        if name == "terminal_states" and not ((field == 0) | (field == 1)).all():
-            raise ValueError(f"terminal_states must be 0 or 1, got {field[(field != 0) & (field != 1)][0]}")
-        with np.errstate(over="ignore"):
-            field = field.astype(np.int32 if name == "actions" else np.float32)
-        if not np.isfinite(field).all():
-            raise ValueError(f"{name} must be finite in float32, got {field[~np.isfinite(field)][0]}")
-    return tf.cast(field, tf.int32 if name == "actions" else tf.float32)
-
-
-def as_share(name: str, value: Any) -> tf.Tensor:
-    """A number in [0, 1] as a float32 scalar."""
-    if not tf.is_tensor(value) or (tf.executing_eagerly() and hasattr(value, "numpy")):
-        value = number(name, np.asarray(value)[()], at_least=0, at_most=1)
-    elif value.shape.rank != 0:
-        raise ValueError(f"{name} must be a scalar, got shape {value.shape}")
-    return tf.cast(value, tf.float32)
-
-
-_PLURALS = ("states", "actions", "rewards", "next_states", "terminal_states")

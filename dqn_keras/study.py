@@ -18,18 +18,19 @@ from typing import Any, NamedTuple
 import cloudpickle
 import gymnasium as gym
 import numpy as np
-import scipy  # whose parts are imported when they are used
 from gymnasium.experimental.functional import FuncEnv
 from joblib import Parallel, cpu_count, delayed, parallel_config
 
-from dqn_keras._tensorflow import tf
+from dqn_keras._engine.programs import shared_in
+from dqn_keras._engine.tensorflow import tf
 from dqn_keras.agent import recycle
-from dqn_keras.checkpoint import FORMAT, from_bytes, replacing, to_bytes
-from dqn_keras.config import Config, count
-from dqn_keras.identity import check_is_same, identity, warn_of_other_versions
-from dqn_keras.programs import shared_in
+from dqn_keras.checks.numbers import check_count
+from dqn_keras.checks.run import check_arguments
+from dqn_keras.config import Config
 from dqn_keras.progress import tqdm
-from dqn_keras.training import check_arguments, train
+from dqn_keras.storage.files import FORMAT, from_bytes, replacing, to_bytes
+from dqn_keras.storage.identity import check_is_same, identity, warn_of_other_versions
+from dqn_keras.training import train
 
 
 class Outcome(NamedTuple):
@@ -117,12 +118,12 @@ def study(
         TypeError, ValueError: as for `train`; or `file` is of another study (the message begins with what differs).
     """
     check_arguments(env, config, verbose)
-    seeds = [count("seeds", seed, at_least=0) for seed in seeds]
+    seeds = [check_count("seeds", seed, at_least=0) for seed in seeds]
     if len(set(seeds)) < len(seeds):
         raise ValueError(f"seeds must name each seed once, got {seeds}")
     if engine not in _ENGINES:
         raise ValueError(f"engine must be one of {', '.join(_ENGINES)}, got {engine!r}")
-    num_workers = cpu_count() if num_workers is None else count("num_workers", num_workers)
+    num_workers = cpu_count() if num_workers is None else check_count("num_workers", num_workers)
     facts = {"format": FORMAT, **identity(env, config)}
     outcomes = {} if file is None else _load(Path(file), facts)
 
@@ -152,6 +153,8 @@ def study(
 
 
 _SECONDS_BETWEEN_SAVES = 10
+
+
 _Results = Generator[Outcome | None, None, None]
 
 
@@ -296,75 +299,3 @@ def load_study(path: str | os.PathLike) -> Study:
     outcomes, facts = _read(Path(path))
     fields = {**facts["config"], "hidden_units": tuple(facts["config"]["hidden_units"])}
     return Study(Config(**fields), list(outcomes.values()))
-
-
-class Estimate(NamedTuple):
-    """A number with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        digits = 1 if abs(self.value) >= 10 else 3
-        if np.isnan(self.low):  # nothing to tell an interval from
-            return f"{self.value:.{digits}f}"
-        return f"{self.value:.{digits}f} ({self.low:.{digits}f} to {self.high:.{digits}f})"
-
-
-class Summary(NamedTuple):
-    """What a study says of its configuration. A seed that was not solved counts with the episodes it had."""
-
-    share_solved: Estimate
-    """Of the seeds, within `num_episodes`; Wilson interval."""
-    median: Estimate
-    """Episodes to solved; bootstrap interval. Not touched by how late the latest are, if most are solved."""
-    interquartile_mean: Estimate
-    """Episodes to solved, mean of the middle half; bootstrap interval."""
-
-
-def summarize(study: Study) -> Summary:
-    """Share of seeds solved, median and interquartile mean of the episodes to solved."""
-    if not study.outcomes:
-        raise ValueError("study must have at least one seed, got none")
-    episodes, num_solved = study.episodes_to_solved, int(np.isfinite(study.solved_at).sum())
-    share = scipy.stats.binomtest(num_solved, len(episodes)).proportion_ci(method="wilson")
-    return Summary(
-        Estimate(num_solved / len(episodes), float(share.low), float(share.high)),
-        _bootstrap(np.median, episodes),
-        _bootstrap(functools.partial(scipy.stats.trim_mean, proportiontocut=0.25), episodes),
-    )
-
-
-class Comparison(NamedTuple):
-    """Of two studies."""
-
-    difference: Estimate
-    """Median episodes to solved of the second minus those of the first."""
-    probability_of_improvement: Estimate
-    """That a run of the second is solved earlier than one of the first; ties count half (Agarwal et al. 2021)."""
-
-
-def compare(first: Study, second: Study) -> Comparison:
-    """How two configurations differ in the episodes they need; bootstrap intervals."""
-    samples = first.episodes_to_solved, second.episodes_to_solved
-    return Comparison(_bootstrap(_difference, *samples), _bootstrap(_probability_of_improvement, *samples))
-
-
-def _difference(first: np.ndarray, second: np.ndarray, axis: int = -1) -> np.ndarray:
-    return np.median(second, axis=axis) - np.median(first, axis=axis)
-
-
-def _probability_of_improvement(first: np.ndarray, second: np.ndarray, axis: int = -1) -> np.ndarray:
-    u = scipy.stats.mannwhitneyu(first, second, axis=axis, method="asymptotic").statistic
-    return u / (first.shape[axis] * second.shape[axis])
-
-
-def _bootstrap(statistic: Any, *samples: np.ndarray) -> Estimate:
-    value = float(statistic(*samples))
-    if all(len(np.unique(sample)) == 1 for sample in samples):  # as in a study of one seed: nothing to resample
-        return Estimate(value, np.nan, np.nan)
-    interval = scipy.stats.bootstrap(
-        samples, statistic, n_resamples=2_000, method="percentile", rng=np.random.default_rng(0), batch=200
-    ).confidence_interval
-    return Estimate(value, float(interval.low), float(interval.high))

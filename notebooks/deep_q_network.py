@@ -31,7 +31,6 @@ from dqn_keras import (
     animate,
     decay_epsilon,
     evaluate,
-    gymnasium_loop,
     learn,
     loss_values,
     make_networks,
@@ -44,6 +43,7 @@ from dqn_keras import (
 )
 from dqn_keras.environments import CartPole
 from dqn_keras.learn import gradient_step
+from dqn_keras.loops import gymnasium
 
 
 def measured_speed():
@@ -136,7 +136,7 @@ source(Experience)
 # \qquad\qquad L(\theta) = \frac{1}{B} \sum_{i=1}^{B} \bigl(y_i - Q(s_i, a_i; \theta)\bigr)^2$$
 #
 # $y - Q(s, a)$ is the *temporal-difference error*: how much better or worse it went than $Q$ had thought. The two
-# functions below take a batch of transitions; `@_takes_a_batch` checks its shapes.
+# functions below take a batch of transitions; `@takes_a_batch` checks its shapes.
 
 # %%
 source(td_targets, loss_values)
@@ -229,7 +229,7 @@ memory.sample(3, rng)
 # weights that its last update, a compiled learning step, has given back.)
 
 # %%
-source(gymnasium_loop._play_episode)
+source(gymnasium._play_episode)
 
 # %% [markdown]
 # And the run: `train` plays episode after episode, until the mean of the last 50 rewards is above 225, or 2,000

@@ -15,10 +15,12 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-from dqn_keras import Config, checkpoint, train
+from dqn_keras import Config, train
 from dqn_keras.agent import make_agent
-from dqn_keras.checkpoint import Checkpoints, from_bytes, to_bytes
 from dqn_keras.environments import CartPole
+from dqn_keras.storage import checkpoint, files
+from dqn_keras.storage.checkpoint import Checkpoints
+from dqn_keras.storage.files import from_bytes, to_bytes
 
 LOOPS = {"Gymnasium loop": lambda: gym.make("CartPole-v1"), "compiled episodes": CartPole}
 CONFIG = Config(num_episodes=250, batch_size=32, memory_size=2_000, solved_reward=1e6)  # its memory goes round
@@ -56,7 +58,7 @@ def _die_in_save(num_saves, num_lines, share):
 
     def tracer(frame, event, _):
         nonlocal num_lines
-        if frame.f_code.co_filename != checkpoint.__file__:
+        if frame.f_code.co_filename not in (checkpoint.__file__, files.__file__):
             return None
         if event == "line":
             num_lines -= 1

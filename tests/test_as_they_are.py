@@ -13,12 +13,12 @@ import tensorflow as tf
 from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras import Config, double_td_targets, learn, make_networks, td_targets, train
+from dqn_keras._engine.programs import _compiled, _shared
 from dqn_keras.agent import make_agent
-from dqn_keras.compiled_loop import episodes
-from dqn_keras.environment import check_spaces
+from dqn_keras.checks.environments import check_spaces
 from dqn_keras.environments import CartPole
 from dqn_keras.environments import cartpole as cartpole_module
-from dqn_keras.programs import _compiled, _shared
+from dqn_keras.loops.compiled import episodes
 from tests import parts
 from tests.parts import NETWORKS, dense, sequential
 

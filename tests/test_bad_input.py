@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dqn_keras import Config, ReplayMemory, action, evaluate, learn, load_agent, make_networks, make_q_network, train
-from dqn_keras.config import counts
+from dqn_keras.checks.numbers import check_counts
 from dqn_keras.environments import CartPole
 from tests.environments import Corridor
 from tests.test_environment import OldReset, OldStep
@@ -129,7 +129,7 @@ OTHERS = {
     "a network for another environment": (lambda: evaluate(Corridor(), network(num_features=3)), "q_network must map"),
     "Q-values of two states": (lambda: action(np.zeros((2, 2)), 0.1, np.random.default_rng(0)), "q_values must be"),
     "a memory of no transitions": (lambda: ReplayMemory(0, (4,)), "memory_size must be"),
-    "no hidden layer": (lambda: counts("hidden_units", []), "hidden_units must hold"),
+    "no hidden layer": (lambda: check_counts("hidden_units", []), "hidden_units must hold"),
     "a file that is no network": (lambda: load_agent(__file__), "path .* is not a network"),
 }
 

@@ -15,9 +15,11 @@ import keras
 import numpy as np
 import pytest
 
-from dqn_keras import Config, checkpoint, evaluate, load_agent, make_networks, train
-from dqn_keras.checkpoint import Checkpoints, from_bytes, to_bytes
+from dqn_keras import Config, evaluate, load_agent, make_networks, train
 from dqn_keras.environments import CartPole
+from dqn_keras.storage.checkpoint import Checkpoints
+from dqn_keras.storage.files import from_bytes, to_bytes
+from dqn_keras.storage.networks import save_agent
 from tests import faults
 from tests.environments import Corridor
 from tests.faults import CONFIG, LOOPS, SEED, final_bits, newest, play
@@ -422,7 +424,7 @@ def test_a_network_that_cannot_be_trusted_is_not_loaded(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"agent\.keras"):
         load_agent(path)
     network, _ = make_networks(4, 2, seed=0)
-    checkpoint.save_agent(path, network)
+    save_agent(path, network)
     good, silent = path.read_bytes(), 0
     rng = np.random.default_rng(0)
     for _ in range(100):
@@ -434,7 +436,7 @@ def test_a_network_that_cannot_be_trusted_is_not_loaded(tmp_path):
             silent += any((a != b).any() for a, b in zip(loaded, network.get_weights(), strict=True))
     assert silent == 0
     network.set_weights([np.full_like(w, np.nan) for w in network.get_weights()])
-    checkpoint.save_agent(path, network)
+    save_agent(path, network)
     with pytest.raises(ValueError, match=r"agent\.keras is not a network that can be loaded: .*not finite"):
         load_agent(path)
     unsafe = keras.Sequential([keras.Input((4,)), keras.layers.Lambda(lambda x: x)])

@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from dqn_keras import Config, evaluate, load_agent, load_study, train
-from dqn_keras.cli import main
+from dqn_keras.cli.options import main
 from dqn_keras.environments import CartPole
 
 SHORT = "--num-episodes 12 --batch-size 16 --solved-reward 1000 --quiet"
@@ -44,7 +44,7 @@ def log(folder):
 def test_help_does_not_wait_for_tensorflow():
     script = """
 import sys
-from dqn_keras.cli import main
+from dqn_keras.cli.options import main
 for arguments in (["--help"], ["train", "--help"], ["--version"]):
     assert main(arguments) == 0
 assert main(["train", "CartPole-v1", "--tau", "2"]) == 2

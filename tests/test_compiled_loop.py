@@ -8,20 +8,15 @@ from gymnasium.experimental.functional import FuncEnv
 from scipy import stats
 
 from dqn_keras import Config, learn, train
-from dqn_keras._tensorflow import require_xla
-from dqn_keras.agent import draws_key, make_agent
-from dqn_keras.compiled_loop import (
-    draw_bits,
-    episode_key,
-    episodes,
-    sample_indices,
-    to_integer,
-    to_uniform,
-)
-from dqn_keras.environment import Spaces
+from dqn_keras._engine.tensorflow import require_xla
+from dqn_keras.agent import make_agent
+from dqn_keras.checks.environments import Spaces
 from dqn_keras.environments import CartPole
+from dqn_keras.loops.compiled import episodes
+from dqn_keras.loops.draws import draw_bits, episode_key, sample_indices, to_integer, to_uniform
 from dqn_keras.policy import decay_epsilon
 from dqn_keras.replay import unpack
+from dqn_keras.seeding import draws_key
 from tests.test_training import QUICK, Tape, fingerprint
 
 START = tf.constant(-(2**62), tf.int64)
@@ -299,7 +294,7 @@ def test_without_xla_the_error_says_what_works(monkeypatch, cartpole):
         raise tf.errors.UnimplementedError(None, None, "Could not find compiler for platform Host")
 
     require_xla.cache_clear()
-    monkeypatch.setattr("dqn_keras._tensorflow._compile_something", no_compiler)
+    monkeypatch.setattr("dqn_keras._engine.tensorflow._compile_something", no_compiler)
     config = Config(num_episodes=9, batch_size=8, gamma=0.123)  # of which no program is there yet
     for env in (CartPole(), cartpole):
         with pytest.raises(RuntimeError, match=r"XLA cannot compile on this machine; Config\(jit_compile=False\)"):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from dqn_keras import Config, make_networks, train
-from dqn_keras.agent import Episode
-from dqn_keras.diagnostics import Log, checked_step, sum_up
+from dqn_keras._engine.numpy_acting import q_values
+from dqn_keras._engine.programs import Learner
+from dqn_keras.checks.batches import as_batch
+from dqn_keras.checks.formulas import Formulas
 from dqn_keras.environments import Acrobot, CartPole
-from dqn_keras.learn import DEFAULT_FORMULAS, Formulas, Metrics, double_td_targets
-from dqn_keras.networks import q_values
-from dqn_keras.programs import Learner
-from dqn_keras.replay import as_batch
+from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, double_td_targets
+from dqn_keras.metrics import Episode, Log, checked_step, sum_up
 from tests.environments import Corridor
 
 
@@ -59,7 +59,7 @@ def episode(reward=1.0, steps=10, terminated=True, max_reward=1.0):
 
 def test_the_moving_average_is_over_the_window_of_the_stop_rule():
     log = Log(Config(solved_window=3))
-    assert [log.add(episode(reward), 1.0).average_reward for reward in (1, 2, 6, 7, 8)] == [1, 1.5, 3, 5, 7]
+    assert [log.add(episode(reward), 1.0)["average_reward"] for reward in (1, 2, 6, 7, 8)] == [1, 1.5, 3, 5, 7]
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_the_moving_average_is_over_the_window_of_the_stop_rule():
 )
 def test_the_bound_is_the_highest_return_that_there_can_be(rewards, gamma, bounds):
     log = Log(Config(gamma=gamma))
-    assert [log.add(episode(max_reward=r), 1.0).q_bound for r in rewards] == pytest.approx(bounds)
+    assert [log.add(episode(max_reward=r), 1.0)["q_bound"] for r in rewards] == pytest.approx(bounds)
 
 
 def test_both_loops_note_the_highest_reward_and_the_end():

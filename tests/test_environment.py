@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from dqn_keras import train
-from dqn_keras.environment import CheckedEnv
+from dqn_keras.checks.environments import CheckedEnv
 from tests.environments import Corridor
 
 

@@ -4,9 +4,10 @@ import psutil
 import pytest
 
 from dqn_keras import Config
-from dqn_keras.agent import episode_seed, make_agent
-from dqn_keras.environment import CheckedEnv
-from dqn_keras.gymnasium_loop import episodes
+from dqn_keras.agent import make_agent
+from dqn_keras.checks.environments import CheckedEnv
+from dqn_keras.loops.gymnasium import episodes
+from dqn_keras.seeding import episode_seed
 from tests import original_algorithm
 from tests.environments import Corridor
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dqn_keras import Config, evaluate, learn, train
+from dqn_keras._engine.private import all_layers, walk
 from tests.parts import INFERENCE_ONLY, LOSSES, NETWORKS, OPTIMIZERS, eager_step
 
 GAMMA, TAU, NUM_STEPS = 0.9, 0.2, 5
@@ -92,6 +93,19 @@ def test_acting_q_hat_and_evaluate_play_the_function_that_the_network_is(name):
     chosen = values[np.arange(len(states)), env.actions]
     np.testing.assert_allclose(chosen, values.max(axis=1), rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(run.q_hat_network(states), values, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ALL_NETWORKS)
+def test_the_public_way_to_all_layers_finds_the_same_that_compute(name):
+    network = ALL_NETWORKS[name]()
+
+    def found(layers):
+        containers = keras.Model | keras.layers.InputLayer
+        return {id(x) for x in layers if x.weights and not isinstance(x, containers)}
+
+    of_attention = {id(x) for x in walk(network) if isinstance(x, keras.layers.MultiHeadAttention)}
+    assert found(walk(network)) <= found(all_layers(network))
+    assert of_attention or found(walk(network)) == found(all_layers(network))
 
 
 @pytest.mark.parametrize("name", ALL_NETWORKS)

@@ -1,14 +1,17 @@
 import gc
+import importlib
 import weakref
 
+import gymnasium as gym
 import keras
 import numpy as np
 import psutil
 import pytest
 import tensorflow as tf
 
-from dqn_keras import Experience, learn, loss_values, make_networks, update_q_hat
-from dqn_keras.programs import _shared
+from dqn_keras import Config, Experience, learn, loss_values, make_networks, train, update_q_hat
+from dqn_keras._engine.programs import _shared
+from dqn_keras.environments import CartPole
 from tests.oracle import Oracle
 
 
@@ -291,3 +294,24 @@ def test_networks_that_do_not_belong_together_are_refused(random_batch):
         learn(batch, 0.95, None, q_hat_network, optimizer)
     with pytest.raises(ValueError, match=r"^optimizer must be a new one, or one that was built for this q_network"):
         learn(batch, 0.95, *make_networks(4, 2), optimizer)
+
+
+def test_without_private_api_the_numbers_are_the_same(random_batch, monkeypatch):
+    programs = importlib.import_module("dqn_keras._engine.programs")
+
+    def run():
+        networks, rng = agent(), np.random.default_rng(1)
+        losses = [float(learn(tuple(rng.permutation(x) for x in batch), 0.95, *networks)) for _ in range(5)]
+        env, config = gym.make("CartPole-v1"), Config(num_episodes=20, batch_size=16)
+        rewards = [train(x, config, seed=0, verbose=0).rewards for x in (env, CartPole())]
+        return losses, np.concatenate([w.ravel() for w in networks[0].get_weights()]), rewards
+
+    batch = random_batch()
+    assert programs.can_swap_variables()
+    fast = run()
+    monkeypatch.setattr(programs, "can_swap_variables", lambda: False)
+    slow = run()
+    np.testing.assert_allclose(fast[0], slow[0], rtol=1e-4)
+    np.testing.assert_allclose(fast[1], slow[1], atol=1e-5)
+    for a, b in zip(fast[2], slow[2], strict=True):
+        np.testing.assert_array_equal(a[:10], b[:10])

@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 
 from dqn_keras import make_networks, make_q_network
-from dqn_keras.networks import check_fits, q_function, q_values
+from dqn_keras._engine.numpy_acting import q_function, q_values
+from dqn_keras.checks.networks import check_fits
 
 
 def test_the_network_is_the_originals():

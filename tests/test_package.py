@@ -5,7 +5,7 @@ import sys
 import pytest
 
 import dqn_keras
-from dqn_keras._tensorflow import require_tensorflow_backend
+from dqn_keras._engine.tensorflow import require_tensorflow_backend
 
 
 def test_learn_is_one_function_under_both_spellings():

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from dqn_keras.cli import _parse
+from dqn_keras.cli.options import _parse
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()

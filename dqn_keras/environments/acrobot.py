@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.experimental.functional import FuncEnv
 
-from dqn_keras._tensorflow import tf
+from dqn_keras._engine.tensorflow import tf
 
 GRAVITY = 9.8  # m/s^2
 MASS, LENGTH, CENTRE, INERTIA = 1.0, 1.0, 0.5, 1.0  # of each link: kg, m, m, kg m^2

@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.experimental.functional import FuncEnv
 
-from dqn_keras._tensorflow import tf
+from dqn_keras._engine.tensorflow import tf
 
 MIN_POSITION, MAX_POSITION, GOAL = -1.2, 0.6, 0.5
 MAX_SPEED = 0.07

@@ -14,14 +14,16 @@ import gymnasium as gym
 import matplotlib.pyplot as plt
 
 from dqn_keras import environments
-from dqn_keras._tensorflow import keras
-from dqn_keras.checkpoint import load_agent, replacing
+from dqn_keras._engine.tensorflow import keras
+from dqn_keras.checks.environments import check_environment
 from dqn_keras.config import Config
-from dqn_keras.diagnostics import Logged
-from dqn_keras.identity import versions
+from dqn_keras.metrics import LOGGED
 from dqn_keras.plotting import plot_history, plot_study
+from dqn_keras.storage.files import replacing
+from dqn_keras.storage.identity import versions
+from dqn_keras.storage.networks import load_agent
 from dqn_keras.study import load_study
-from dqn_keras.training import Run, check_environment, train
+from dqn_keras.training import Run, train
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,7 +185,7 @@ def _read_rows(log: Path) -> dict[int, dict[str, float]]:
         with log.open(newline="") as file:
             for row in csv.DictReader(file):
                 with contextlib.suppress(KeyError, TypeError, ValueError):
-                    values = {name: float(row[name]) for name in Logged._fields}
+                    values = {name: float(row[name]) for name in LOGGED}
                     rows[int(row["epoch"])] = {**values, "steps": int(values["steps"])}
     return rows
 
@@ -194,7 +196,7 @@ def _write_rows(log: Path, rows: dict[int, dict[str, float]]) -> None:
         log.unlink(missing_ok=True)
         return
     with replacing(log) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["epoch", *sorted(Logged._fields)])
+        writer = csv.DictWriter(file, ["epoch", *sorted(LOGGED)])
         writer.writeheader()
         writer.writerows({"epoch": episode, **rows[episode]} for episode in sorted(rows))
 
@@ -202,7 +204,7 @@ def _write_rows(log: Path, rows: dict[int, dict[str, float]]) -> None:
 def read_log(folder: Path) -> dict[str, list[float]]:
     """What log.csv holds, as `run.history`."""
     rows = _read_rows(folder / "log.csv")
-    return {name: [rows[episode][name] for episode in sorted(rows)] for name in Logged._fields}
+    return {name: [rows[episode][name] for episode in sorted(rows)] for name in LOGGED}
 
 
 def draw(folder: Path) -> Path:

@@ -19,12 +19,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 
-from dqn_keras._tensorflow import keras, tf
+from dqn_keras._engine.copies import _quiet_about_lambdas
+from dqn_keras._engine.private import all_layers
+from dqn_keras._engine.tensorflow import keras, tf
+from dqn_keras._engine.watching import is_of_a_library, read_by
+from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
-from dqn_keras.learn import DEFAULT_FORMULAS, Formulas
-from dqn_keras.networks import all_layers, structure
+from dqn_keras.learn import DEFAULT_FORMULAS
 from dqn_keras.version import __version__
-from dqn_keras.watching import is_of_a_library, read_by
 
 
 def identity(
@@ -242,3 +244,32 @@ def _processor() -> str:
         flags = None
     vector = sorted(x for x in flags[1].split() if x.startswith(("sse4", "avx", "fma", "amx"))) if flags else []
     return " ".join([platform.machine(), *vector])
+
+
+def structure(network: keras.Model) -> str:
+    """Equal for networks of one configuration, but for names and for initializers, which have done their work."""
+    with _quiet_about_lambdas():
+        return json.dumps(_without_names(network.get_config(), {}), sort_keys=True, default=repr)
+
+
+def _without_names(config: Any, numbers: dict[str, int]) -> Any:
+    """`numbers` are those of the layers, which refer to each other by name in a functional model."""
+    if isinstance(config, list | tuple):
+        return [_without_names(x, numbers) for x in config]
+    if not isinstance(config, dict):
+        return config
+    if isinstance(layers := config.get("layers"), list):
+        numbers = {layer.get("name", layer["config"].get("name")): i for i, layer in enumerate(layers)}
+    kept = {key: x for key, x in config.items() if key != "name" and not key.endswith("_initializer")}
+    for key, value in kept.items():
+        if key in ("keras_history", "input_layers", "output_layers"):
+            kept[key] = _numbered(value, numbers)
+        elif key != "dtype":
+            kept[key] = _without_names(value, numbers)
+    return kept
+
+
+def _numbered(reference: Any, numbers: dict[str, int]) -> Any:
+    if isinstance(reference, list | tuple):
+        return [_numbered(x, numbers) for x in reference]
+    return numbers.get(reference, reference) if isinstance(reference, str) else reference

@@ -11,15 +11,20 @@ import re
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from dqn_keras._tensorflow import keras, require_xla, tf
-from dqn_keras.graphs import fingerprint
-from dqn_keras.networks import make_q_network, units_if_made_here
-
-
-def check_optimizer(optimizer: Any) -> None:
-    """TypeError if it is not one of Keras."""
-    if not isinstance(optimizer, keras.Optimizer):
-        raise TypeError(f"optimizer must be a Keras optimizer such as keras.optimizers.Adam(1e-3), got {optimizer!r}")
+from dqn_keras._engine.graphs import fingerprint
+from dqn_keras._engine.layers import _NarrowDense
+from dqn_keras._engine.made_here import units_if_made_here
+from dqn_keras._engine.private import (
+    caller,
+    can_swap_variables,
+    custom_gradients_forgotten,
+    handle,
+    is_built_for,
+    is_plain_adam,
+)
+from dqn_keras._engine.tensorflow import keras, require_xla, tf
+from dqn_keras.checks.networks import check_optimizer
+from dqn_keras.networks import make_q_network
 
 
 class Learner(NamedTuple):
@@ -47,48 +52,18 @@ class Learner(NamedTuple):
             raise ValueError("q_network must have weights that can be trained, got none")
         if not optimizer.built:
             optimizer.build(q_network.trainable_variables)
-        try:
-            optimizer._check_variables_are_known(q_network.trainable_variables)
-        except ValueError:
+        if not is_built_for(optimizer, q_network.trainable_variables):
             raise ValueError(
                 f"optimizer must be a new one, or one that was built for this q_network; {optimizer.name!r} was built "
                 "for other variables"
-            ) from None
+            )
 
     def sizes(self) -> tuple[int, ...] | None:
         """The sizes of the networks if the package made them and Adam is as Keras makes it; else None."""
         units = units_if_made_here(self.q_network)
         if units is None or units != units_if_made_here(self.q_hat_network):
             return None
-        return units if _is_plain_adam(self.optimizer, self.q_network.trainable_variables) else None
-
-
-def _is_plain_adam(optimizer: keras.Optimizer, variables: Sequence[keras.Variable]) -> bool:
-    """Whether it is an Adam of which nothing but the learning rate was chosen, built for these variables."""
-    if type(optimizer) is not keras.optimizers.Adam or not isinstance(optimizer._learning_rate, keras.Variable):
-        return False
-    built_for = optimizer._trainable_variables
-    return (
-        all(getattr(optimizer, name) == value for name, value in _PLAIN_ADAM.items())
-        and not vars(optimizer).keys() & {"apply", "apply_gradients", "scale_loss", "update_step"}
-        and len(built_for) == len(variables)
-        and all(a is b for a, b in zip(built_for, variables, strict=True))
-    )
-
-
-_PLAIN_ADAM = {
-    "beta_1": 0.9,
-    "beta_2": 0.999,
-    "epsilon": 1e-7,
-    "amsgrad": False,
-    "weight_decay": None,
-    "clipnorm": None,
-    "clipvalue": None,
-    "global_clipnorm": None,
-    "use_ema": False,
-    "loss_scale_factor": None,
-    "gradient_accumulation_steps": None,
-}
+        return units if is_plain_adam(self.optimizer, self.q_network.trainable_variables) else None
 
 
 def _stand_in(units: Sequence[int], jit_compile: bool) -> Learner:
@@ -107,38 +82,19 @@ def _stand_in(units: Sequence[int], jit_compile: bool) -> Learner:
     return learner
 
 
-class _NarrowDense(keras.layers.Dense):
-    """Keras' Dense for a few outputs, such as the values of a few actions; only its gradient is written otherwise.
-
-    TensorFlow's gradient is two products with a transposed matrix, for which XLA has only slow loops where the
-    matrix is so narrow: a third of a whole learning step of the 4-64-2 network.
-    """
-
-    def call(self, inputs: tf.Tensor, training: bool | None = None) -> tf.Tensor:
-        return _narrow_product(tf.convert_to_tensor(inputs), tf.convert_to_tensor(self.kernel)) + self.bias
-
-
-@tf.custom_gradient
-def _narrow_product(x: tf.Tensor, kernel: tf.Tensor) -> tuple[tf.Tensor, Callable]:
-    """The product of x [B, U] and kernel [U, A], and its gradient as a sum over the A columns."""
-
-    def gradient(dy: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:  # [B, A]
-        columns = range(kernel.shape[1])
-        dx = sum(dy[:, a, None] * kernel[None, :, a] for a in columns)  # [B, U]
-        return dx, tf.stack([tf.reduce_sum(x * dy[:, a, None], axis=0) for a in columns], axis=1)
-
-    return x @ kernel, gradient
-
-
 class _Program(NamedTuple):
-    function: Any
-    """TensorFlow's, to be called with tensors alone."""
+    function: Callable[..., list[tf.Tensor]]
+    """Of its arguments, and of what it captures."""
     captured: list[int | tf.Tensor]
     """What the function takes beside its arguments: the number of one of the learner's variables, or a constant."""
 
 
 _shared: dict[Hashable, _Program] = {}
+
+
 _of_this_study: dict[Hashable, _Program] | None = None
+
+
 _compiled: dict[Hashable, Any] = {}
 """Functions traced from the user's parts, by their fingerprint: what XLA compiled for them stays in memory anyway."""
 
@@ -178,6 +134,8 @@ def bind(
     """
     if jit_compile:
         require_xla()
+    if not can_swap_variables():
+        return _trace_the_public_way(make_function, specs, learner, variables, jit_compile)
     sizes = learner.sizes()
     if sizes is None:
         program = _trace(make_function, specs, learner, variables, jit_compile)
@@ -190,10 +148,16 @@ def bind(
         program = programs[key]
     handles = _handles(learner, variables)
     captured = [handles[x] if isinstance(x, int) else x for x in program.captured]
-    # Calling the ConcreteFunction would first bind its arguments to a signature, which takes half as long as a step.
-    call_flat = program.function.call_flat
-    call = lambda *tensors, _kept=program: call_flat(*tensors, *captured)  # noqa: E731
+    call = lambda *tensors, _kept=program: program.function(*tensors, *captured)  # noqa: E731
     return call if sizes is not None else _saying_what_xla_refused(call)
+
+
+def _trace_the_public_way(
+    make_function: Callable, specs: Sequence, learner: Learner, variables: Sequence[tf.Variable], jit_compile: bool
+) -> Callable[..., list[tf.Tensor]]:
+    function = tf.function(make_function(learner, variables), jit_compile=jit_compile, autograph=False)
+    concrete = function.get_concrete_function(*specs)
+    return _saying_what_xla_refused(lambda *tensors: tf.nest.flatten(concrete(*tensors)))
 
 
 def _saying_what_xla_refused(call: Callable) -> Callable:
@@ -217,33 +181,13 @@ def _trace(
 ) -> _Program:
     """The program, traced on these very objects. If an equal one was compiled before, that is used."""
     function = tf.function(make_function(learner, variables), jit_compile=jit_compile, autograph=False)
-    with _custom_gradients_forgotten():
+    with custom_gradients_forgotten():
         concrete = function.get_concrete_function(*specs)
     numbers = {id(handle): i for i, handle in enumerate(_handles(learner, variables))}
     captured = [numbers.get(id(x), x) for x in concrete.captured_inputs]
     concrete = _compiled.setdefault((fingerprint(concrete), jit_compile), concrete)
-    return _Program(concrete.inference_fn, captured)
-
-
-@contextlib.contextmanager
-def _custom_gradients_forgotten() -> Iterator[None]:
-    """Forgets the gradients of tf.custom_gradient that are registered within, each of which keeps a whole graph alive.
-
-    They are there to differentiate a function once more, which nobody does with a program.
-    """
-    try:
-        from tensorflow.python.framework.ops import gradient_registry
-
-        registry = gradient_registry._registry
-    except (ImportError, AttributeError):  # another TensorFlow; then they stay
-        registry = {}
-    before = set(registry)
-    try:
-        yield
-    finally:
-        for name in set(registry) - before:
-            del registry[name]
+    return _Program(caller(concrete), captured)
 
 
 def _handles(learner: Learner, variables: Sequence[tf.Variable]) -> list[tf.Tensor]:
-    return [*(v.value.handle for v in learner.variables), *(v.handle for v in variables)]
+    return [handle(variable) for variable in (*learner.variables, *variables)]

@@ -11,16 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from dqn_keras._tensorflow import tf
-from dqn_keras.agent import Agent, DivergedError, Episode, episode_seed
+from dqn_keras._engine.numpy_acting import is_relu_mlp, q_values
+from dqn_keras._engine.programs import Learner, bind
+from dqn_keras._engine.tensorflow import tf
+from dqn_keras.agent import Agent, DivergedError
+from dqn_keras.checks.environments import CheckedEnv
+from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
-from dqn_keras.diagnostics import checked_step, sum_up
-from dqn_keras.environment import CheckedEnv
-from dqn_keras.learn import DEFAULT_FORMULAS, Formulas, Metrics
-from dqn_keras.networks import is_relu_mlp, q_values
+from dqn_keras.learn import DEFAULT_FORMULAS, Metrics
+from dqn_keras.metrics import Episode, checked_step, sum_up
 from dqn_keras.policy import action, decay_epsilon
-from dqn_keras.programs import Learner, bind
 from dqn_keras.replay import Experience, unpack
+from dqn_keras.seeding import episode_seed
 
 
 def episodes(

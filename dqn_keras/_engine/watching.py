@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
-from dqn_keras._tensorflow import keras
+from dqn_keras._engine.tensorflow import keras
 
 _KERAS_PARTS = (
     keras.layers.Layer,
@@ -20,6 +20,8 @@ _KERAS_PARTS = (
     keras.regularizers.Regularizer,
     keras.constraints.Constraint,
 )
+
+
 _LARGEST_CONTAINER = 1_000  # beyond, what is in it is not looked at
 
 

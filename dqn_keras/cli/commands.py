@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dqn_keras import run_folder
-from dqn_keras.agent import checked_seed
-from dqn_keras.config import count
+from dqn_keras.checks.numbers import check_count
+from dqn_keras.cli import run_folder
+from dqn_keras.cli.run_folder import Recipe, Settings
 from dqn_keras.evaluation import evaluate as play_greedily
 from dqn_keras.rendering import record_episode, save_animation
-from dqn_keras.run_folder import Recipe, Settings
+from dqn_keras.seeding import checked_seed
+from dqn_keras.statistics import summarize
 from dqn_keras.study import study as train_seeds
-from dqn_keras.study import summarize
 from dqn_keras.training import Run
 
 if TYPE_CHECKING:
-    from dqn_keras import cli
+    from dqn_keras.cli import options as cli
 
 
 def train(options: "cli.Train") -> int:
@@ -74,7 +74,7 @@ def study(options: "cli.Study") -> int:
     outcome = train_seeds(
         _recipe(options).make_for_training(),
         options.config,
-        range(count("seeds", options.seeds)),
+        range(check_count("seeds", options.seeds)),
         file=folder / "study.npz",
         num_workers=options.workers,
         verbose=0 if options.quiet else 1,

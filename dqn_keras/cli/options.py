@@ -22,6 +22,8 @@ from dqn_keras.config import Config
 from dqn_keras.version import __version__
 
 Flag = FlagCreatePairsOff[bool]
+
+
 Folder = Annotated[Positional[Path], arg(metavar="FOLDER")]
 
 
@@ -133,7 +135,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command = _parse(arguments)
         if isinstance(command, int):
             return command
-        from dqn_keras import commands
+        from dqn_keras.cli import commands
 
         warnings.formatwarning = lambda message, *_: f"dqn-keras: {_in_plain_text(str(message))}\n"
         return getattr(commands, type(command).__name__.lower())(command)

@@ -1,4 +1,4 @@
-"""The door between a gymnasium.Env and the rest: what comes through it is of the right kind, and finite."""
+"""The door between an environment and the rest: what comes through it is of the right kind, and finite."""
 
 import math
 from collections.abc import Callable
@@ -6,6 +6,10 @@ from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.experimental.functional import FuncEnv
+
+from dqn_keras._engine.tensorflow import keras, require_xla, tf
+from dqn_keras.checks.networks import check_fits
 
 
 class CheckedEnv:
@@ -113,4 +117,46 @@ def check_spaces(name: str, observations: gym.Space, actions: gym.Space) -> Spac
 
 
 _BOOLS = (bool, np.bool_)
+
+
 _LARGEST = float(np.finfo(np.float32).max)
+
+
+def check_functional(env: FuncEnv) -> Spaces:
+    """The sizes of its spaces; an error that names the environment if the loop cannot play it."""
+    require_xla()
+    name = type(env).__name__
+    spaces = check_spaces(name, env.observation_space, env.action_space)
+    rng = tf.constant([0, 0], tf.int64)
+    state = env.initial(rng)
+    next_state = env.transition(state, tf.constant(spaces.first_action), rng)
+    specs = [
+        tf.nest.map_structure(lambda x: (tf.shape(x).numpy().tolist(), x.dtype.name), s) for s in (state, next_state)
+    ]
+    if specs[0] != specs[1]:
+        raise ValueError(f"env {name}: transition must return a state like initial's, {specs[0]}, got {specs[1]}")
+    for part, value, shape in [
+        ("observation", env.observation(state, rng), spaces.state_shape),
+        ("reward", env.reward(state, tf.constant(spaces.first_action), next_state, rng), ()),
+        ("terminal", env.terminal(state, rng), ()),
+    ]:
+        if tuple(tf.shape(value)) != shape:
+            raise ValueError(f"env {name}: {part} must have shape {shape}, got {tuple(tf.shape(value).numpy())}")
+    return spaces
+
+
+def check_environment(env: gym.Env | FuncEnv, q_network: keras.Model | None = None) -> Spaces:
+    """The sizes of its spaces; ValueError if they are not supported, or not by the network (None: the default one)."""
+    if isinstance(env, FuncEnv):
+        name, spaces = type(env).__name__, check_functional(env)
+    else:
+        door = CheckedEnv(env)
+        name, spaces = door.name, door.spaces
+    if q_network is not None:
+        check_fits(q_network, spaces.state_shape, spaces.num_actions)
+    elif len(spaces.state_shape) != 1:
+        raise ValueError(
+            f"env {name} has observations of shape {spaces.state_shape}, the default network takes one axis: "
+            "q_network must be a network of your own, got None (or wrap env in gymnasium.wrappers.FlattenObservation)"
+        )
+    return spaces

@@ -4,6 +4,7 @@ Three loops stand in one another: episodes; in them turns, each of which ends wi
 up to that update. Nothing random outlives a turn: its draws follow from the run's seed, the episode and the turn.
 """
 
+import functools
 import math
 import sys
 import time
@@ -13,17 +14,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 
-from dqn_keras._tensorflow import require_xla, tf
-from dqn_keras.agent import Agent, DivergedError, Episode, draws_key
+from dqn_keras._engine.programs import Learner, bind
+from dqn_keras._engine.tensorflow import tf
+from dqn_keras.agent import Agent, DivergedError
+from dqn_keras.checks.environments import Spaces
+from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
-from dqn_keras.diagnostics import checked_step
-from dqn_keras.environment import Spaces, check_spaces
 from dqn_keras.environments import TWINS
-from dqn_keras.learn import DEFAULT_FORMULAS, Formulas, Metrics
-from dqn_keras.networks import is_all_finite
+from dqn_keras.learn import DEFAULT_FORMULAS, Metrics
+from dqn_keras.loops.draws import draw_bits, episode_key, sample_indices, to_integer, to_uniform
+from dqn_keras.metrics import Episode, checked_step, is_all_finite
 from dqn_keras.policy import decay_epsilon
-from dqn_keras.programs import Learner, bind
 from dqn_keras.replay import Experience, pack, unpack
+from dqn_keras.seeding import draws_key
 
 
 def episodes(
@@ -74,6 +77,8 @@ def episodes(
 
 
 _SECONDS_PER_CALL = 0.25
+
+
 _CAPACITY = 100
 """Episodes that one call can play."""
 
@@ -146,49 +151,9 @@ def _constants(cls: type) -> Hashable:
     return tuple((name, x) for name, x in named.items() if isinstance(x, int | float))
 
 
-def draw_bits(num: int, key: tf.Tensor, counter: Any) -> tf.Tensor:
-    """Random bits, [num] uint32, that follow from two int64 numbers (Philox, Salmon et al. 2011)."""
-    seed = tf.stack([key, tf.cast(counter, tf.int64)])
-    return tf.random.stateless_uniform([num], seed, minval=None, maxval=None, dtype=tf.uint32, alg="philox")
-
-
-def to_uniform(bits: tf.Tensor) -> tf.Tensor:
-    """Bits as float32 in [0, 1), in steps of 2^-24."""
-    return tf.cast(tf.bitwise.right_shift(bits, tf.constant(8, tf.uint32)), tf.float32) * 2.0**-24
-
-
-def to_integer(bits: tf.Tensor, bound: Any) -> tf.Tensor:
-    """Bits as int32 in [0, bound); no value is favoured by more than bound / 2^32."""
-    product = tf.cast(bits, tf.uint64) * tf.cast(bound, tf.uint64)
-    return tf.cast(tf.bitwise.right_shift(product, tf.constant(32, tf.uint64)), tf.int32)
-
-
-def sample_indices(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any) -> tf.Tensor:
-    """As many different indices in [0, size) as there are bits, uniformly: what is a repeat is drawn again.
-
-    An index goes only if an earlier one is equal, and every value is as likely to be hit; so by symmetry all sets of
-    different indices are equally likely.
-    """
-    batch_size = bits.shape[0]
-    is_earlier = tf.constant(np.triu(np.ones((batch_size, batch_size), bool), 1))  # [i, j]: i < j
-
-    def repeats(indices: tf.Tensor) -> tf.Tensor:
-        return tf.reduce_any((indices[:, None] == indices[None, :]) & is_earlier, axis=0)  # [B]
-
-    def redraw(indices: tf.Tensor, is_repeat: tf.Tensor, attempt: tf.Tensor) -> tuple[tf.Tensor, ...]:
-        fresh = draw_bits(batch_size, key, tf.cast(counter, tf.int64) + attempt)
-        indices = tf.where(is_repeat, to_integer(fresh, size), indices)
-        return indices, repeats(indices), attempt + _NEXT_ATTEMPT
-
-    indices = to_integer(bits, size)
-    start = (indices, repeats(indices), tf.constant(_NEXT_ATTEMPT, tf.int64))
-    return tf.while_loop(lambda _, is_repeat, __: tf.reduce_any(is_repeat), redraw, start)[0]
-
-
-_NEXT_ATTEMPT = 2**32  # above every turn's number
-
-
 _FAULTS = ("nothing", "an observation", "a reward", "the loss or a weight")
+
+
 _DIVERGED = 3
 
 
@@ -253,48 +218,6 @@ class _Program:
 
     def _play_episode(self, key: tf.Tensor, epsilon: tf.Tensor) -> tuple[_Facts, tf.Tensor]:
         """-> what it was like, and what was not finite in it, an index of _FAULTS."""
-        n, batch_size, memory_size = self._config.steps_per_update, self._config.batch_size, self._config.memory_size
-
-        def turn(state: Any, is_over: tf.Tensor, facts: _Facts, fault: tf.Tensor) -> tuple[Any, ...]:
-            number = (facts.steps + n - 1) // n  # turn 0 is step 0, turn k the n steps up to step k n
-            bits = draw_bits(2 * n + batch_size, key, number)
-
-            def step(
-                state: Any, is_over: tf.Tensor, reward: tf.Tensor, most: tf.Tensor, t: tf.Tensor, *_: tf.Tensor
-            ) -> tuple[Any, ...]:
-                j = (t + n - 1) % n
-                rng = tf.stack([key, -1 - tf.cast(t, tf.int64)])
-                state, new_reward, terminated, fault = self._step(state, epsilon, bits[j], bits[n + j], rng)
-                is_over = terminated | (t + 1 >= self._numbers.max_steps) | (fault > 0)
-                reward, most = reward + tf.cast(new_reward, tf.float64), tf.maximum(most, new_reward)
-                return state, is_over, reward, most, t + 1, t % n == 0, terminated, fault
-
-            start = (state, is_over, facts.reward, facts.max_reward, facts.steps, False, facts.terminated, fault)
-            state, is_over, reward, max_reward, steps, is_update, terminated, fault = tf.while_loop(
-                lambda state, is_over, reward, most, t, is_update, *_: ~is_over & ~is_update,
-                step,
-                tf.nest.map_structure(tf.convert_to_tensor, start),
-            )
-
-            is_update &= (fault == 0) & (self._num_appended >= batch_size)
-            size = tf.cast(tf.minimum(self._num_appended, memory_size), tf.int32)
-            loss, mean_q, max_q, td_error = tf.cond(
-                is_update,
-                lambda: self._update(sample_indices(bits[2 * n :], key, number, size)),
-                lambda: _NO_UPDATE,
-            )
-            fault = tf.where(tf.math.is_finite(loss), fault, _DIVERGED)
-            facts = _Facts(
-                reward,
-                steps,
-                facts.sums + tf.stack([loss, mean_q, td_error]),
-                tf.maximum(facts.max_q, max_q),
-                max_reward,
-                facts.updates + tf.cast(is_update, tf.int32),
-                terminated,
-            )
-            return state, is_over | (fault > 0), facts, fault
-
         rng = tf.stack([key, tf.constant(-(2**62), tf.int64)])
         state = self._env.initial(rng)
         observation = self._observation(state, rng)
@@ -302,8 +225,53 @@ class _Program:
         zero, least = tf.constant(0), tf.constant(-math.inf)
         facts = _Facts(tf.constant(0, tf.float64), zero, tf.zeros([3]), least, least, zero, tf.constant(False))
         start = ((state, observation), fault > 0, facts, fault)
+        turn = functools.partial(self._turn, key, epsilon)
         _, _, facts, fault = tf.while_loop(lambda state, is_over, *_: ~is_over, turn, start)
         return facts, fault
+
+    def _turn(
+        self, key: tf.Tensor, epsilon: tf.Tensor, state: Any, is_over: tf.Tensor, facts: _Facts, fault: tf.Tensor
+    ) -> tuple[Any, ...]:
+        """The env steps up to the next update, and the update: -> state, is_over, facts, fault."""
+        n, batch_size, memory_size = self._config.steps_per_update, self._config.batch_size, self._config.memory_size
+        number = (facts.steps + n - 1) // n  # turn 0 is step 0, turn k the n steps up to step k n
+        bits = draw_bits(2 * n + batch_size, key, number)
+
+        def step(
+            state: Any, is_over: tf.Tensor, reward: tf.Tensor, most: tf.Tensor, t: tf.Tensor, *_: tf.Tensor
+        ) -> tuple[Any, ...]:
+            j = (t + n - 1) % n
+            rng = tf.stack([key, -1 - tf.cast(t, tf.int64)])
+            state, new_reward, terminated, fault = self._step(state, epsilon, bits[j], bits[n + j], rng)
+            is_over = terminated | (t + 1 >= self._numbers.max_steps) | (fault > 0)
+            reward, most = reward + tf.cast(new_reward, tf.float64), tf.maximum(most, new_reward)
+            return state, is_over, reward, most, t + 1, t % n == 0, terminated, fault
+
+        start = (state, is_over, facts.reward, facts.max_reward, facts.steps, False, facts.terminated, fault)
+        state, is_over, reward, max_reward, steps, is_update, terminated, fault = tf.while_loop(
+            lambda state, is_over, reward, most, t, is_update, *_: ~is_over & ~is_update,
+            step,
+            tf.nest.map_structure(tf.convert_to_tensor, start),
+        )
+
+        is_update &= (fault == 0) & (self._num_appended >= batch_size)
+        size = tf.cast(tf.minimum(self._num_appended, memory_size), tf.int32)
+        loss, mean_q, max_q, td_error = tf.cond(
+            is_update,
+            lambda: self._update(sample_indices(bits[2 * n :], key, number, size)),
+            lambda: _NO_UPDATE,
+        )
+        fault = tf.where(tf.math.is_finite(loss), fault, _DIVERGED)
+        facts = _Facts(
+            reward,
+            steps,
+            facts.sums + tf.stack([loss, mean_q, td_error]),
+            tf.maximum(facts.max_q, max_q),
+            max_reward,
+            facts.updates + tf.cast(is_update, tf.int32),
+            terminated,
+        )
+        return state, is_over | (fault > 0), facts, fault
 
     def _step(
         self, state: Any, epsilon: tf.Tensor, bits: tf.Tensor, action_bits: tf.Tensor, rng: tf.Tensor
@@ -335,31 +303,3 @@ class _Program:
 
 
 _NO_UPDATE = Metrics(loss=0.0, mean_q=0.0, max_q=-math.inf, td_error=0.0)
-
-
-def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:
-    """The number that all of an episode's draws follow from, int64."""
-    return tf.bitcast(draw_bits(2, key, episode), tf.int64)
-
-
-def check_functional(env: FuncEnv) -> Spaces:
-    """The sizes of its spaces; an error that names the environment if the loop cannot play it."""
-    require_xla()
-    name = type(env).__name__
-    spaces = check_spaces(name, env.observation_space, env.action_space)
-    rng = tf.constant([0, 0], tf.int64)
-    state = env.initial(rng)
-    next_state = env.transition(state, tf.constant(spaces.first_action), rng)
-    specs = [
-        tf.nest.map_structure(lambda x: (tf.shape(x).numpy().tolist(), x.dtype.name), s) for s in (state, next_state)
-    ]
-    if specs[0] != specs[1]:
-        raise ValueError(f"env {name}: transition must return a state like initial's, {specs[0]}, got {specs[1]}")
-    for part, value, shape in [
-        ("observation", env.observation(state, rng), spaces.state_shape),
-        ("reward", env.reward(state, tf.constant(spaces.first_action), next_state, rng), ()),
-        ("terminal", env.terminal(state, rng), ()),
-    ]:
-        if tuple(tf.shape(value)) != shape:
-            raise ValueError(f"env {name}: {part} must have shape {shape}, got {tuple(tf.shape(value).numpy())}")
-    return spaces

@@ -5,13 +5,8 @@ written under another name, flushed to the disk, and only then given its own, so
 """
 
 import contextlib
-import hashlib
-import io
-import json
 import os
 import warnings
-import zipfile
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +14,15 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 
-from dqn_keras._tensorflow import keras
-from dqn_keras.agent import Agent, Episode
+from dqn_keras._engine.tensorflow import keras
+from dqn_keras.agent import Agent
+from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
-from dqn_keras.identity import check_is_same, identity, warn_of_other_versions
-from dqn_keras.learn import DEFAULT_FORMULAS, Formulas, Metrics
-from dqn_keras.networks import check_is_equal, check_network, finalize_layers, python_random_kept
+from dqn_keras.learn import DEFAULT_FORMULAS, Metrics
+from dqn_keras.metrics import Episode
 from dqn_keras.replay import unpack
-from dqn_keras.version import __version__
-
-FORMAT = 3
+from dqn_keras.storage.files import FORMAT, DamagedError, from_bytes, replacing, to_bytes
+from dqn_keras.storage.identity import check_is_same, identity, warn_of_other_versions
 
 
 class Checkpoints:
@@ -42,14 +36,48 @@ class Checkpoints:
         q_network: keras.Model | None = None,
         optimizer: keras.Optimizer | None = None,
         formulas: Formulas = DEFAULT_FORMULAS,
+        every: int = 100,
     ) -> None:
         self.folder = Path(folder)
+        self._every, self._saved_at = every, 0
         self._identity = identity(env, config, q_network, optimizer, formulas)
         self._kept: list[Path] = []  # the newest first, all known to be whole
 
     def paths(self) -> list[Path]:
         """The files, the newest first."""
         return sorted(self.folder.glob(f"checkpoint-{'[0-9]' * 10}.npz"), reverse=True)
+
+    def begin(self, agent: Agent, seed: int | None, resume: bool) -> Path | None:
+        """Brings the agent to where the run is, and has a file there before any work starts; the file it is from."""
+        if not resume and (paths := self.paths()):
+            raise ValueError(
+                f"checkpoint {paths[0]} is there already; resume=True goes on from it, another folder starts anew"
+            )
+        path = self.restore(agent, seed) if resume else None
+        if path is None:
+            self.save(agent)
+        self._saved_at = len(agent.episodes)
+        return path
+
+    def save_when_due(self, agent: Agent) -> None:
+        """Saves if it is `every` episodes since the last time, or more. A disk that refuses is a warning."""
+        if len(agent.episodes) >= self._saved_at + self._every:
+            self._save_or_warn(agent)
+
+    def save_the_end(self, agent: Agent, has_callbacks: bool) -> None:
+        """Saves what is new since the last time; callbacks may have changed the agent in `on_train_end`."""
+        if has_callbacks or len(agent.episodes) > self._saved_at:
+            self._save_or_warn(agent)
+
+    def _save_or_warn(self, agent: Agent) -> None:
+        self._saved_at = len(agent.episodes)
+        try:
+            self.save(agent)
+        except OSError as error:
+            warnings.warn(
+                f"checkpoint after episode {len(agent.episodes) - 1} could not be saved ({error}); the last one stays",
+                stacklevel=4,
+            )
 
     def save(self, agent: Agent) -> None:
         """Save the state of `agent`, which must be at an episode's end; OSError if the disk does not take it."""
@@ -94,35 +122,6 @@ class Checkpoints:
         if damaged:
             raise ValueError(f"checkpoint: {'; '.join(damaged)}")
         return None
-
-
-class DamagedError(ValueError):
-    """Why a file is no whole checkpoint."""
-
-
-def to_bytes(arrays: Mapping[str, Any], facts: dict[str, Any]) -> bytes:
-    """The content of a checkpoint file."""
-    file = io.BytesIO()
-    np.savez(file, allow_pickle=False, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
-    body = file.getvalue()
-    return body + hashlib.sha256(body).digest()
-
-
-def from_bytes(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The opposite of `to_bytes`; an error that says why, if the content is not as that made it."""
-    body, digest = content[:-32], content[-32:]
-    if hashlib.sha256(body).digest() != digest:
-        raise DamagedError("its SHA-256 is not that of its content, so that it has been cut short or changed")
-    try:
-        with np.load(io.BytesIO(body), allow_pickle=False) as archive:
-            arrays = dict(archive)
-        facts = json.loads(arrays.pop("facts").tobytes())
-        file_format = facts["format"]
-    except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:
-        raise DamagedError(f"it is not a checkpoint ({error})") from None
-    if file_format != FORMAT:
-        raise DamagedError(f"its format is {file_format!r}, and dqn_keras {__version__} reads {FORMAT}")
-    return arrays, facts
 
 
 def _arrays(agent: Agent) -> dict[str, Any]:
@@ -199,75 +198,3 @@ def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any])
     agent.seed, agent.epsilon, agent.rng = facts["seed"], epsilon, rng
     for name, variable in _variables(agent).items():
         variable.assign(arrays[name])
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path`, which takes its place at once when the block has ended without an error."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
-    try:
-        yield temporary
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
-    if os.name == "posix":  # the folder's list of names, too
-        descriptor = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-
-def save_agent(path: str | os.PathLike, q_network: keras.Model) -> None:
-    """Save the network alone, in Keras' own format; an older file of that name is replaced at once.
-
-    Raises:
-        ValueError: `path` does not end in .keras; the network has a layer of an unregistered class.
-        OSError: the disk does not take it.
-    """
-    path = Path(path)
-    if path.suffix != ".keras":
-        raise ValueError(f"path must end in .keras, got {str(path)!r}")
-    try:
-        with python_random_kept():
-            network = type(q_network).from_config(q_network.get_config())  # which has no optimizer to save
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            "q_network has a layer that no file can name: keras.saving.register_keras_serializable() on its class, and "
-            f"get_config in it, make it one ({error})"
-        ) from error
-    network.set_weights(q_network.get_weights())
-    finalize_layers(network)
-    check_is_equal("q_network cannot be saved", q_network, network)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        network.save(temporary)
-
-
-def load_agent(path: str | os.PathLike) -> keras.Model:
-    """The network that `run.save` saved, for `evaluate`, or whatever a Keras model is good for.
-
-    It is Keras' own format, in Keras' safe mode: a file that would run code of its own is refused.
-
-    Raises:
-        FileNotFoundError: there is none.
-        ValueError: it is damaged or not a Q-network; the message names the file.
-    """
-    path = Path(path)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if (broken := archive.testzip()) is not None:  # Keras reads parts, and so checks no sum
-                raise ValueError(f"{broken} in it is damaged")
-        network = keras.saving.load_model(path, compile=False, safe_mode=True)
-        check_network("it", network)
-        if not all(np.isfinite(w).all() for w in network.get_weights()):
-            raise ValueError("one of its weights is not finite")
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # whatever Keras, h5py or zipfile say of bytes that are not theirs
-        raise ValueError(f"path {path} is not a network that can be loaded: {error}") from error
-    return network

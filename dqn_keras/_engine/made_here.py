@@ -1,0 +1,23 @@
+"""Which networks the package made itself, and so knows all of."""
+
+import weakref
+
+from dqn_keras._engine.numpy_acting import is_relu_mlp
+from dqn_keras._engine.tensorflow import keras
+
+_made_here: weakref.WeakSet[keras.Model] = weakref.WeakSet()
+
+
+def units_if_made_here(network: keras.Model) -> tuple[int, ...] | None:
+    """The sizes of all layers, states to actions, of a network that `make_q_network` made and nobody has altered.
+
+    None for any other network, and where a layer was given another activation, a regularizer, a constraint or a method
+    of its own, or was frozen.
+    """
+    if network not in _made_here or not is_relu_mlp(network):
+        return None
+    for layer in network.layers:
+        added = (layer.kernel_regularizer, layer.bias_regularizer, layer.activity_regularizer)
+        if any(added) or layer.kernel_constraint or layer.bias_constraint or not layer.trainable:
+            return None
+    return (network.input_shape[-1], *(layer.units for layer in network.layers))

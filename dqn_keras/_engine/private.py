@@ -1,0 +1,129 @@
+"""Private API of TensorFlow and Keras, all of it, each use with a public way that is taken where it is missing."""
+
+import contextlib
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from dqn_keras._engine.tensorflow import keras, tf
+
+
+@functools.cache
+def can_swap_variables() -> bool:
+    """Whether a traced function can be called with other variables in the place of those it was traced with.
+
+    If not, a program is traced for each agent, and called the public way: slower, with the same results.
+    """
+    try:
+        first, second = tf.Variable(1.0), tf.Variable(2.0)
+        concrete = tf.function(lambda x: x * first, autograph=False).get_concrete_function(tf.TensorSpec(()))
+        index = [id(x) for x in concrete.captured_inputs].index(id(first.handle))
+        captured = list(concrete.captured_inputs)
+        captured[index] = second.handle
+        return caller(concrete)(tf.constant(3.0), *captured)[0].numpy() == 6.0
+    except Exception:  # whatever another version does instead
+        return False
+
+
+def caller(concrete: Any) -> Callable[..., list[tf.Tensor]]:
+    """A ConcreteFunction as a function of its arguments and everything it captures.
+
+    Calling the ConcreteFunction itself would first bind its arguments to a signature, which takes half as long as a
+    learning step.
+    """
+    return concrete.inference_fn.call_flat
+
+
+def handle(variable: Any) -> tf.Tensor:
+    """What a traced function captures of a variable, Keras' or TensorFlow's."""
+    return (variable.value if isinstance(variable, keras.Variable) else variable).handle
+
+
+@contextlib.contextmanager
+def custom_gradients_forgotten() -> Iterator[None]:
+    """Forgets the gradients of tf.custom_gradient that are registered within, each of which keeps a whole graph alive.
+
+    They are there to differentiate a function once more, which nobody does with a program.
+    """
+    try:
+        from tensorflow.python.framework.ops import gradient_registry
+
+        registry = gradient_registry._registry
+    except (ImportError, AttributeError):  # then they stay
+        registry = {}
+    before = set(registry)
+    try:
+        yield
+    finally:
+        for name in set(registry) - before:
+            del registry[name]
+
+
+def all_layers(network: keras.Model) -> list[keras.layers.Layer]:
+    """The layers of the network, those in nested models and in wrappers included."""
+    if hasattr(network, "_flatten_layers"):
+        return network._flatten_layers(include_self=False)
+    return walk(network)
+
+
+def walk(network: keras.Model) -> list[keras.layers.Layer]:
+    """The same, the public way."""
+    layers: list[keras.layers.Layer] = []
+    to_do = list(network.layers)
+    while to_do:
+        layer = to_do.pop(0)
+        if not any(layer is x for x in layers):
+            layers.append(layer)
+            inner = [getattr(layer, name, None) for name in ("layer", "cell", "forward_layer", "backward_layer")]
+            to_do += [*getattr(layer, "layers", []), *(x for x in inner if isinstance(x, keras.layers.Layer))]
+    return layers
+
+
+def is_built_for(optimizer: keras.Optimizer, variables: Sequence[keras.Variable]) -> bool:
+    """Whether a built optimizer knows these variables; True where that cannot be seen, and Keras says so later."""
+    try:
+        optimizer._check_variables_are_known(variables)
+    except ValueError:
+        return False
+    except AttributeError:
+        pass
+    return True
+
+
+def is_plain_adam(optimizer: keras.Optimizer, variables: Sequence[keras.Variable]) -> bool:
+    """Whether it is an Adam of which nothing but the learning rate was chosen, built for just these variables."""
+    if type(optimizer) is not keras.optimizers.Adam:
+        return False
+    rate, built_for = getattr(optimizer, "_learning_rate", None), getattr(optimizer, "_trainable_variables", [])
+    return (
+        isinstance(rate, keras.Variable)
+        and all(getattr(optimizer, name) == value for name, value in _PLAIN_ADAM.items())
+        and not vars(optimizer).keys() & {"apply", "apply_gradients", "scale_loss", "update_step"}
+        and len(built_for) == len(variables)
+        and all(a is b for a, b in zip(built_for, variables, strict=True))
+    )
+
+
+_PLAIN_ADAM = {
+    "beta_1": 0.9,
+    "beta_2": 0.999,
+    "epsilon": 1e-7,
+    "amsgrad": False,
+    "weight_decay": None,
+    "clipnorm": None,
+    "clipvalue": None,
+    "global_clipnorm": None,
+    "use_ema": False,
+    "loss_scale_factor": None,
+    "gradient_accumulation_steps": None,
+}
+
+
+def arguments_of_compile(network: keras.Model) -> dict[str, Any]:
+    """What `network.compile` was called with; nothing where that cannot be seen."""
+    return getattr(getattr(network, "_compile_config", None), "config", {})
+
+
+def output_shape_of_lambda(layer: keras.layers.Lambda) -> Any:
+    """As it was given; None where that cannot be seen, and Keras then finds it out."""
+    return getattr(layer, "_output_shape", None)

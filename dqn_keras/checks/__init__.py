@@ -1,0 +1,1 @@
+"""What is checked at the doors: numbers, batches, networks, environments."""

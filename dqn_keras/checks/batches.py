@@ -1,0 +1,81 @@
+"""Checks of a batch at the doors of the learning step."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from dqn_keras._engine.tensorflow import keras, tf
+from dqn_keras.checks.networks import check_network
+from dqn_keras.checks.numbers import check_number
+from dqn_keras.replay import Experience
+
+
+def as_batch(experiences: Sequence[Any], state_shape: tuple[int, ...], num_actions: int) -> Experience:
+    """Any five arrays as tensors of the right dtypes; an error that names the field if one cannot be that.
+
+    A reward of shape [B, 1] would otherwise broadcast against [B] to a loss over [B, B], without a word. Values are
+    checked where there are any: inside a tf.function there are not.
+    """
+    if len(experiences) != len(_PLURALS):
+        raise ValueError(f"experiences must be the five fields {', '.join(_PLURALS)}, got {len(experiences)}")
+    fields = []
+    for name, field in zip(_PLURALS, experiences, strict=True):
+        try:
+            fields.append(field if tf.is_tensor(field) else np.asarray(field))
+        except ValueError as error:
+            raise ValueError(f"{name} must be an array: {error}") from None
+    num_transitions = fields[0].shape[0] if len(fields[0].shape) else None
+    if num_transitions == 0:
+        raise ValueError("states must hold at least one transition, got none")
+    vector, states = [num_transitions], [num_transitions, *state_shape]
+    shapes = [states, vector, vector, states, vector]
+    return Experience(*(_checked(*x, num_actions) for x in zip(_PLURALS, fields, shapes, strict=True)))
+
+
+def _checked(name: str, field: Any, shape: list, num_actions: int) -> tf.Tensor:
+    got = tf.TensorShape(field.shape)
+    if got.rank != len(shape) or not got.is_compatible_with(shape):
+        raise ValueError(f"{name} must have shape {shape}, got {got}")
+    dtype = tf.as_dtype(field.dtype) if field.dtype != object else tf.string
+    if not (dtype.is_integer or (name != "actions" and (dtype.is_floating or dtype.is_bool))):
+        raise ValueError(f"{name} must be {'whole numbers' if name == 'actions' else 'numbers'}, got {dtype.name}")
+    if not tf.is_tensor(field) or (tf.executing_eagerly() and hasattr(field, "numpy")):
+        field = np.asarray(field)
+        if name == "actions" and not (field.min() >= 0 and field.max() < num_actions):  # XLA would clamp it
+            raise ValueError(f"actions must lie in 0..{num_actions - 1}, got {field.min()}..{field.max()}")
+        if name == "terminal_states" and not ((field == 0) | (field == 1)).all():
+            raise ValueError(f"terminal_states must be 0 or 1, got {field[(field != 0) & (field != 1)][0]}")
+        with np.errstate(over="ignore"):
+            field = field.astype(np.int32 if name == "actions" else np.float32)
+        if not np.isfinite(field).all():
+            raise ValueError(f"{name} must be finite in float32, got {field[~np.isfinite(field)][0]}")
+    return tf.cast(field, tf.int32 if name == "actions" else tf.float32)
+
+
+def as_share(name: str, value: Any) -> tf.Tensor:
+    """A number in [0, 1] as a float32 scalar."""
+    if not tf.is_tensor(value) or (tf.executing_eagerly() and hasattr(value, "numpy")):
+        value = check_number(name, np.asarray(value)[()], at_least=0, at_most=1)
+    elif value.shape.rank != 0:
+        raise ValueError(f"{name} must be a scalar, got shape {value.shape}")
+    return tf.cast(value, tf.float32)
+
+
+_PLURALS = ("states", "actions", "rewards", "next_states", "terminal_states")
+
+
+def takes_a_batch(formula: Callable) -> Callable:
+    """Lets `formula` be called with any five arrays: they are checked, and reach it as an Experience of tensors."""
+
+    @functools.wraps(formula)
+    def checked(
+        experiences: Sequence[Any], gamma: Any, q_network: keras.Model, q_hat_network: keras.Model
+    ) -> tf.Tensor:
+        check_network("q_network", q_network)
+        check_network("q_hat_network", q_hat_network)
+        batch = as_batch(experiences, q_network.input_shape[1:], q_network.output_shape[-1])
+        return formula(batch, as_share("gamma", gamma), q_network, q_hat_network)
+
+    return checked

@@ -1,0 +1,71 @@
+"""Checks of a network and an optimizer before they are used."""
+
+import inspect
+import warnings
+from typing import Any
+
+import numpy as np
+
+from dqn_keras._engine.private import all_layers
+from dqn_keras._engine.tensorflow import keras, tf
+
+
+def check_network(name: str, network: keras.Model) -> None:
+    """TypeError or ValueError if it is no built Sequential or functional model, states [B, *S] -> Q-values [B, A]."""
+    if not isinstance(network, keras.Sequential | keras.models.Model):
+        raise TypeError(f"{name} must be a Keras model, got {network!r}")
+    if not network.built or not hasattr(network, "input_shape"):
+        raise ValueError(f"{name} must be a Sequential or functional model with an Input layer")
+    for kind, tensors in ("input", network.inputs), ("output", network.outputs):
+        if len(tensors) != 1:
+            raise ValueError(f"{name} must have one {kind}, got {len(tensors)}")
+    shape, dtype = network.output_shape, network.outputs[0].dtype
+    if not isinstance(shape, tuple) or len(shape) != 2 or shape[1] is None:
+        raise ValueError(f"{name} must give Q-values of shape [B, A], got output {shape}")
+    if dtype != "float32":
+        raise ValueError(f"{name} must give float32 values, got {dtype}")
+
+
+def check_fits(q_network: keras.Model, state_shape: tuple[int, ...], num_actions: int) -> None:
+    """ValueError if the network does not take this environment's states or give its actions' values, all finite."""
+    check_network("q_network", q_network)
+    takes, gives = q_network.input_shape, q_network.output_shape
+    fits = isinstance(takes, tuple) and tf.TensorShape(takes).is_compatible_with((None, *state_shape))
+    if not fits or gives != (None, num_actions):
+        raise ValueError(
+            f"q_network must map states of shape {state_shape} to {num_actions} actions, "
+            f"got input {_without_batch(takes)} and output {_without_batch(gives)}"
+        )
+    if not all(np.isfinite(w).all() for w in q_network.get_weights()):
+        raise ValueError("q_network must have finite weights, got NaN or infinity among them")
+
+
+def _without_batch(shape: Any) -> Any:
+    return shape[1:] if isinstance(shape, tuple) and shape[0] is None else shape
+
+
+def check_optimizer(optimizer: Any) -> None:
+    """TypeError if it is not one of Keras."""
+    if not isinstance(optimizer, keras.Optimizer):
+        raise TypeError(f"optimizer must be a Keras optimizer such as keras.optimizers.Adam(1e-3), got {optimizer!r}")
+
+
+def warn_of_inference_mode(network: keras.Model) -> None:
+    """Warns of layers that would do something else in training: a Q-network is always called in inference mode."""
+    if names := [f"{x.name} ({type(x).__name__})" for x in all_layers(network) if _differs_in_training(x)]:
+        warnings.warn(
+            f"q_network is called in inference mode, also while it learns: {', '.join(names)} will not do there what "
+            "model.fit would have it do",
+            stacklevel=4,
+        )
+
+
+def _differs_in_training(layer: keras.layers.Layer) -> bool:
+    if isinstance(layer, keras.layers.BatchNormalization | keras.layers.SpectralNormalization):
+        return True
+    if type(layer).__name__.endswith("Cell"):  # whose RNN is one of the layers, too
+        return False
+    if not type(layer).__module__.startswith("keras."):
+        return "training" in inspect.signature(type(layer).call).parameters
+    rates = (getattr(layer, name, 0) for name in ("rate", "stddev", "dropout", "recurrent_dropout", "_dropout"))
+    return any(isinstance(rate, int | float) and rate > 0 for rate in rates)

@@ -1,0 +1,82 @@
+"""Checks of what `train` and `study` are called with."""
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+
+import gymnasium as gym
+from gymnasium.experimental.functional import FuncEnv
+
+from dqn_keras._engine.private import arguments_of_compile
+from dqn_keras._engine.tensorflow import keras
+from dqn_keras.agent import owners_optimizer
+from dqn_keras.checks.formulas import Formulas
+from dqn_keras.checks.networks import check_optimizer, warn_of_inference_mode
+from dqn_keras.config import Config
+
+
+def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> None:
+    """TypeError or ValueError that names the one which cannot be used."""
+    if not isinstance(env, gym.Env | FuncEnv):
+        raise TypeError(f"env must be a gymnasium.Env or a FuncEnv, got {env!r}")
+    if not isinstance(config, Config):
+        raise TypeError(f"config must be a Config, got {config!r}")
+    if verbose not in (0, 1, 2):
+        raise ValueError(f"verbose must be 0, 1 or 2, got {verbose!r}")
+    if isinstance(env, FuncEnv) and not config.jit_compile:
+        raise ValueError("jit_compile must be True for a functional environment, got False: its loop needs XLA")
+
+
+def check_callbacks(
+    callbacks: keras.callbacks.Callback | Sequence[keras.callbacks.Callback],
+) -> list[keras.callbacks.Callback]:
+    """Returns one callback, or several, as a list; TypeError if one is none of Keras."""
+    callbacks = [callbacks] if isinstance(callbacks, keras.callbacks.Callback) else list(callbacks)
+    for callback in callbacks:
+        if not isinstance(callback, keras.callbacks.Callback):
+            raise TypeError(f"callbacks must be Keras callbacks, got {callback!r}")
+    return callbacks
+
+
+def check_own_parts(
+    config: Config,
+    q_network: keras.Model | None,
+    optimizer: keras.Optimizer | None,
+    targets: Callable,
+    loss: str | Callable | None,
+) -> Formulas:
+    """The formulas to learn by; TypeError, ValueError or a warning for what cannot be used, or not as it is meant."""
+    if optimizer is not None:
+        check_optimizer(optimizer)
+    owners = None if q_network is None else owners_optimizer(q_network)
+    if owners is not None:
+        if loss is None:
+            loss = getattr(q_network, "loss", None)
+        config_of_compile = arguments_of_compile(q_network)
+        ignored = [x for x in ("metrics", "weighted_metrics", "loss_weights") if config_of_compile.get(x)]
+        if ignored:
+            warnings.warn(f"{', '.join(ignored)} of q_network.compile are not used by train", stacklevel=3)
+    formulas = Formulas(targets, "mse" if loss is None else loss)
+    formulas.check()
+    if (in_use := optimizer or owners) is not None:
+        check_learning_rate(in_use, config)
+    if q_network is not None:
+        warn_of_inference_mode(q_network)
+    return formulas
+
+
+def check_learning_rate(optimizer: keras.Optimizer, config: Config) -> None:
+    """ValueError if alpha says something else; a warning if it is a Python function, which is not called each time."""
+    rate = optimizer.learning_rate
+    is_alpha = isinstance(rate, keras.Variable) and math.isclose(rate.numpy(), config.alpha, rel_tol=1e-6)
+    if config.alpha != Config.alpha and not is_alpha:
+        raise ValueError(
+            f"alpha must be left at its default of {Config.alpha} with an optimizer of your own, whose learning rate "
+            f"counts, got {config.alpha}"
+        )
+    if isinstance(rate, int | float):
+        warnings.warn(
+            f"the learning rate of {optimizer.name!r} is a Python function, which is called once, when the learning "
+            f"step is compiled: it stays at {rate}; a keras.optimizers.schedules.LearningRateSchedule would change",
+            stacklevel=4,
+        )

@@ -1,0 +1,54 @@
+"""The random draws of compiled episodes: every one follows from the run's seed, the episode and the turn."""
+
+from typing import Any
+
+import numpy as np
+
+from dqn_keras._engine.tensorflow import tf
+
+
+def draw_bits(num: int, key: tf.Tensor, counter: Any) -> tf.Tensor:
+    """Random bits, [num] uint32, that follow from two int64 numbers (Philox, Salmon et al. 2011)."""
+    seed = tf.stack([key, tf.cast(counter, tf.int64)])
+    return tf.random.stateless_uniform([num], seed, minval=None, maxval=None, dtype=tf.uint32, alg="philox")
+
+
+def to_uniform(bits: tf.Tensor) -> tf.Tensor:
+    """Bits as float32 in [0, 1), in steps of 2^-24."""
+    return tf.cast(tf.bitwise.right_shift(bits, tf.constant(8, tf.uint32)), tf.float32) * 2.0**-24
+
+
+def to_integer(bits: tf.Tensor, bound: Any) -> tf.Tensor:
+    """Bits as int32 in [0, bound); no value is favoured by more than bound / 2^32."""
+    product = tf.cast(bits, tf.uint64) * tf.cast(bound, tf.uint64)
+    return tf.cast(tf.bitwise.right_shift(product, tf.constant(32, tf.uint64)), tf.int32)
+
+
+def sample_indices(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any) -> tf.Tensor:
+    """As many different indices in [0, size) as there are bits, uniformly: what is a repeat is drawn again.
+
+    An index goes only if an earlier one is equal, and every value is as likely to be hit; so by symmetry all sets of
+    different indices are equally likely.
+    """
+    batch_size = bits.shape[0]
+    is_earlier = tf.constant(np.triu(np.ones((batch_size, batch_size), bool), 1))  # [i, j]: i < j
+
+    def repeats(indices: tf.Tensor) -> tf.Tensor:
+        return tf.reduce_any((indices[:, None] == indices[None, :]) & is_earlier, axis=0)  # [B]
+
+    def redraw(indices: tf.Tensor, is_repeat: tf.Tensor, attempt: tf.Tensor) -> tuple[tf.Tensor, ...]:
+        fresh = draw_bits(batch_size, key, tf.cast(counter, tf.int64) + attempt)
+        indices = tf.where(is_repeat, to_integer(fresh, size), indices)
+        return indices, repeats(indices), attempt + _NEXT_ATTEMPT
+
+    indices = to_integer(bits, size)
+    start = (indices, repeats(indices), tf.constant(_NEXT_ATTEMPT, tf.int64))
+    return tf.while_loop(lambda _, is_repeat, __: tf.reduce_any(is_repeat), redraw, start)[0]
+
+
+_NEXT_ATTEMPT = 2**32  # above every turn's number
+
+
+def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:
+    """The number that all of an episode's draws follow from, int64."""
+    return tf.bitcast(draw_bits(2, key, episode), tf.int64)

@@ -1,0 +1,67 @@
+"""Files that are whole or not there: written beside their place, and checked by a digest when they are read."""
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dqn_keras.version import __version__
+
+FORMAT = 3
+
+
+class DamagedError(ValueError):
+    """Why a file is no whole checkpoint."""
+
+
+def to_bytes(arrays: Mapping[str, Any], facts: dict[str, Any]) -> bytes:
+    """The content of a checkpoint file."""
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
+    body = file.getvalue()
+    return body + hashlib.sha256(body).digest()
+
+
+def from_bytes(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The opposite of `to_bytes`; an error that says why, if the content is not as that made it."""
+    body, digest = content[:-32], content[-32:]
+    if hashlib.sha256(body).digest() != digest:
+        raise DamagedError("its SHA-256 is not that of its content, so that it has been cut short or changed")
+    try:
+        with np.load(io.BytesIO(body), allow_pickle=False) as archive:
+            arrays = dict(archive)
+        facts = json.loads(arrays.pop("facts").tobytes())
+        file_format = facts["format"]
+    except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:
+        raise DamagedError(f"it is not a checkpoint ({error})") from None
+    if file_format != FORMAT:
+        raise DamagedError(f"its format is {file_format!r}, and dqn_keras {__version__} reads {FORMAT}")
+    return arrays, facts
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary file beside `path`, which takes its place at once when the block has ended without an error."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+    if os.name == "posix":  # the folder's list of names, too
+        descriptor = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
