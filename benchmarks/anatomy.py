@@ -14,6 +14,7 @@ import numpy as np
 import tensorflow as tf
 
 from dqn_keras import Config
+from dqn_keras._engine.programs import stand_in
 from dqn_keras.agent import make_agent
 from dqn_keras.checks.environments import check_functional
 from dqn_keras.environments import CartPole
@@ -76,7 +77,7 @@ def whole_turn() -> tuple[float, float]:
 def main() -> None:
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # Linux
     agent, rng = make_agent((4,), 2, CONFIG, 0), np.random.default_rng(0)
-    learner = agent.learner.template(jit_compile=True)  # whose layers are those that a program compiles
+    learner = stand_in((4, 64, 2), jit_compile=True)  # whose layers are those that a program compiles
     data = rng.normal(size=agent.memory.rows.shape).astype(np.float32)
     data[:, 8:] = np.stack([rng.integers(2, size=len(data)), np.ones(len(data)), np.zeros(len(data))], axis=1)
     rows = tf.Variable(data)
@@ -97,7 +98,7 @@ def main() -> None:
         "the same, and the loss (one pass through each network)": forward,
         "the same, with the gradient, Adam and the soft update: the whole update": lambda i: gradient_step(
             batch(i), CONFIG.gamma, *learner, CONFIG.tau
-        ),
+        ).loss,
         "draw 64 different indices": sample,
     }
     print("# Where the time of the compiled loop goes\n")

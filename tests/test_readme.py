@@ -32,3 +32,5 @@ def test_the_readmes_links_and_map_name_what_is_there():
         assert (ROOT / target).exists(), target
     for module in (ROOT / "dqn_keras").glob("[!_]*.py"):
         assert module.name in README or module.name in {"version.py"}, module.name
+    for folder in (ROOT / "dqn_keras").glob("*/__init__.py"):
+        assert f"  {folder.parent.name}/" in README, folder

@@ -66,7 +66,7 @@ class Learner(NamedTuple):
         return units if is_plain_adam(self.optimizer, self.q_network.trainable_variables) else None
 
 
-def _stand_in(units: Sequence[int], jit_compile: bool) -> Learner:
+def stand_in(units: Sequence[int], jit_compile: bool) -> Learner:
     """Networks of these sizes, states to actions, and their Adam, with variables of their own."""
     num_features, *hidden_units, num_actions = units
 
@@ -144,7 +144,7 @@ def bind(
         key = (key, sizes, tuple(specs), tuple((v.shape, v.dtype) for v in variables), jit_compile)
         if key not in programs:
             extra = [tf.Variable(tf.zeros_like(v)) for v in variables]
-            programs[key] = _trace(make_function, specs, _stand_in(sizes, jit_compile), extra, jit_compile)
+            programs[key] = _trace(make_function, specs, stand_in(sizes, jit_compile), extra, jit_compile)
         program = programs[key]
     handles = _handles(learner, variables)
     captured = [handles[x] if isinstance(x, int) else x for x in program.captured]
