@@ -96,9 +96,9 @@ def main() -> None:
     parts = {
         "gather the batch": lambda i: tf.reduce_sum(batch(i).state),
         "the same, and the loss (one pass through each network)": forward,
-        "the same, with the gradient, Adam and the soft update: the whole update": lambda i: gradient_step(
-            batch(i), CONFIG.gamma, *learner, CONFIG.tau
-        ).loss,
+        "the same, with the gradient, Adam and the soft update: the whole update": lambda i: (
+            gradient_step(batch(i), CONFIG.gamma, *learner, CONFIG.tau).loss
+        ),
         "draw 64 different indices": sample,
     }
     print("# Where the time of the compiled loop goes\n")

@@ -87,10 +87,11 @@ def make_agent(
 _compiled_here: weakref.WeakKeyDictionary[keras.Model, keras.Optimizer] = weakref.WeakKeyDictionary()
 
 
-def owners_optimizer(q_network: keras.Model) -> keras.Optimizer | None:
+def owners_optimizer(q_network: keras.Model | None) -> keras.Optimizer | None:
     """The optimizer that the network was compiled with by whoever made it; None if it was not, or only here."""
-    is_compiled = q_network.compiled and q_network.optimizer is not _compiled_here.get(q_network)
-    return q_network.optimizer if is_compiled else None
+    if q_network is None or not q_network.compiled or q_network.optimizer is _compiled_here.get(q_network):
+        return None
+    return q_network.optimizer
 
 
 def _optimizer_for(q_network: keras.Model, optimizer: keras.Optimizer | None, config: Config) -> keras.Optimizer:

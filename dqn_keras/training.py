@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras._engine.tensorflow import keras
-from dqn_keras.agent import Agent, make_agent, optimizer_shown
+from dqn_keras.agent import Agent, make_agent, optimizer_shown, owners_optimizer
 from dqn_keras.callbacks import with_callbacks
 from dqn_keras.checks.environments import CheckedEnv, Spaces, check_environment, some_states
 from dqn_keras.checks.formulas import Formulas
@@ -155,7 +155,8 @@ def train(
     formulas = check_own_parts(config, q_network, optimizer, targets, loss)
     checkpoints = None
     if checkpoint is not None:
-        checkpoints = Checkpoints(checkpoint, env, config, q_network, optimizer, formulas, checkpoint_every)
+        in_use = optimizer or owners_optimizer(q_network)
+        checkpoints = Checkpoints(checkpoint, env, config, q_network, in_use, formulas, checkpoint_every)
 
     some = some_states(env.observation_space, spaces.state_dtype)
     sizes = spaces.state_shape, spaces.num_actions
@@ -175,7 +176,8 @@ def train(
         if checkpoints and not run.diverged:
             checkpoints.save_the_end(agent, has_callbacks=bool(callbacks))
         run.interrupted = is_asked_to_stop()
-    agent.optimizer.finalize_variable_values(agent.q_network.trainable_variables)  # as `fit` does: averages, if it has
+    if agent.num_updates:  # as `fit` does: if the optimizer keeps averages, they are the result
+        agent.optimizer.finalize_variable_values(agent.q_network.trainable_variables)
     progress.show_end(checkpoints.folder if checkpoints else None)
     if not (agent.num_updates or run.interrupted or run.diverged):
         warnings.warn(

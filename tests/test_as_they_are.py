@@ -758,3 +758,156 @@ def test_a_run_with_own_parts_is_resumed_bit_for_bit(make_env, tmp_path):
     whole = run(12)
     run(5, checkpoint=tmp_path)
     np.testing.assert_array_equal(whole, run(12, checkpoint=tmp_path, resume=True))
+
+
+# What a review found
+
+
+class Clipped(keras.Sequential):
+    def call(self, inputs, training=None, mask=None):
+        return tf.clip_by_value(super().call(inputs), -50.0, 50.0)
+
+
+def instance_with_a_call():
+    network = sequential(dense(8))
+    network.call = lambda inputs, training=None, mask=None: 0 * inputs[:, :2]
+    return network
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: Clipped([keras.Input((4,)), dense(2)]), instance_with_a_call], ids=["a subclass", "an instance"]
+)
+def test_a_network_with_a_call_of_its_own_is_refused_where_q_hat_would_lose_it(make, cartpole):
+    with pytest.raises(ValueError, match=r"^q_network cannot be copied for Q-hat: .* has a `call` of its own"):
+        train(cartpole, QUICK, q_network=make(), verbose=0)
+
+
+def test_a_lambda_over_the_weights_of_another_layer_is_refused(cartpole):
+    layer = dense(8)
+    tied = keras.layers.Lambda(lambda x: x @ tf.transpose(layer.kernel))
+    network = sequential(layer, tied)
+    before = network.get_weights()
+    with pytest.raises(ValueError, match=r"^q_network cannot be copied for Q-hat: a layer uses weights that are not"):
+        train(cartpole, QUICK, q_network=network, verbose=0)
+    assert all(map(np.array_equal, before, network.get_weights()))
+
+
+class Base:
+    factor = 1.0
+
+    def of(self, error):
+        return self.factor * tf.square(error)
+
+
+class Derived(Base):
+    def __call__(self, y, q):
+        return tf.reduce_mean(self.of(y - q))
+
+
+def scaled_error(scale, y, q):
+    return scale * FACTOR * tf.reduce_mean(tf.square(y - q))
+
+
+ARRAY = np.ones(1, np.float32)
+
+
+def loss_by_array(y, q):
+    return ARRAY[0] * tf.reduce_mean(tf.square(y - q))
+
+
+DEEPER_CHANGES = {
+    "an attribute of a base class": (Derived(), lambda patch: patch.setattr(Base, "factor", 3.0)),
+    "a method of a base class": (Derived(), lambda patch: patch.setattr(Base, "of", lambda self, error: 9 * error**2)),
+    "a global that a partial reads": (functools.partial(scaled_error, 1.0), changed_global),
+    "an array changed in place": (loss_by_array, lambda patch: ARRAY.fill(3.0)),
+}
+
+
+@pytest.mark.parametrize("change", DEEPER_CHANGES)
+def test_learn_sees_deeper_changes(change, monkeypatch, random_batch):
+    loss, apply = DEEPER_CHANGES[change]
+    networks, batch = fresh(), random_batch(8)
+    first = float(learn(batch, 0.9, *networks, keras.optimizers.SGD(0.0), loss=loss))
+    apply(monkeypatch)
+    assert float(learn(batch, 0.9, *networks, keras.optimizers.SGD(0.0), loss=loss)) > 2 * first
+    optimizer = keras.optimizers.SGD(0.0)
+    monkeypatch.undo()
+    ARRAY.fill(1.0)
+    learn(batch, 0.9, *networks, optimizer, loss=loss)
+    apply(monkeypatch)
+    assert float(learn(batch, 0.9, *networks, optimizer, loss=loss)) > 2 * first
+    ARRAY.fill(1.0)
+
+
+def test_what_is_set_on_a_weight_of_the_packages_network_counts(random_batch):
+    for change in ("trainable", "constraint"):
+        (q_network, q_hat_network), optimizer = fresh(), keras.optimizers.Adam(0.01)
+        before = q_network.get_weights()[0]
+        setattr(q_network.layers[0].kernel, change, False if change == "trainable" else keras.constraints.NonNeg())
+        learn(random_batch(8), 0.9, q_network, q_hat_network, optimizer)
+        after = q_network.get_weights()[0]
+        assert np.array_equal(before, after) if change == "trainable" else (after >= 0).all()
+
+
+def test_averages_of_no_update_do_not_become_the_network(cartpole):
+    optimizer = keras.optimizers.SGD(0.1, use_ema=True)
+    with pytest.warns(UserWarning, match="without an update"):
+        run = train(cartpole, Config(num_episodes=2, max_steps=40), seed=0, optimizer=optimizer, verbose=0)
+    assert np.abs(run.q_network.get_weights()[0]).sum() > 1
+
+
+def test_a_compiled_networks_optimizer_is_part_of_what_must_be_the_same(tmp_path, cartpole):
+    def go_on(optimizer, resume=True):
+        network = NETWORKS["dense"]()
+        network.compile(optimizer, loss="mse")
+        train(cartpole, QUICK, seed=0, q_network=network, checkpoint=tmp_path, resume=resume, verbose=0)
+
+    go_on(keras.optimizers.SGD(0.1), resume=False)
+    go_on(keras.optimizers.SGD(0.1))
+    with pytest.raises(ValueError, match=r"^optimizer is "):
+        go_on(keras.optimizers.SGD(0.5, clipnorm=1e-3))
+
+
+class OwnLoss(keras.losses.Loss):
+    def call(self, y, q):
+        return FACTOR * tf.reduce_mean(tf.square(y - q), axis=-1)
+
+
+class Two:
+    def first(self, y, q):
+        return tf.reduce_mean(tf.square(y - q))
+
+    def second(self, y, q):
+        return 1000 * tf.reduce_mean(tf.square(y - q))
+
+
+def test_losses_are_known_by_all_that_they_compute_with(tmp_path, cartpole, monkeypatch):
+    def go_on(loss, folder, resume=True):
+        train(cartpole, QUICK, seed=0, loss=loss, checkpoint=tmp_path / folder, resume=resume, verbose=0)
+
+    module = __import__(__name__, fromlist="_")
+    go_on(OwnLoss(), "own", resume=False)
+    go_on(OwnLoss(), "own")  # which Keras calls by another name
+    go_on(Two().first, "method", resume=False)
+    go_on(loss_by_helper, "helper", resume=False)
+    with pytest.raises(ValueError, match=r"^loss is "):
+        go_on(Two().second, "method")
+    monkeypatch.setattr(module, "FACTOR", 7.0)
+    with pytest.raises(ValueError, match=r"^loss is "):
+        go_on(OwnLoss(), "own")
+    monkeypatch.setattr(module, "helper", bent)
+    with pytest.raises(ValueError, match=r"^loss is "):
+        go_on(loss_by_helper, "helper")
+
+
+def test_a_compiled_network_with_a_list_of_losses_is_refused(cartpole):
+    network = NETWORKS["dense"]()
+    network.compile(sgd(), loss=["mse"])
+    with pytest.raises(ValueError, match=r"^q_network must be compiled with one loss, got "):
+        train(cartpole, QUICK, q_network=network, verbose=0)
+
+
+def test_another_reward_of_the_packages_cartpole_is_seen(monkeypatch):
+    before = train(CartPole(), QUICK, seed=0, verbose=0).rewards
+    monkeypatch.setattr(CartPole, "reward", lambda *_: tf.constant(7.0))
+    np.testing.assert_array_equal(train(CartPole(), QUICK, seed=0, verbose=0).rewards, 7 * before)

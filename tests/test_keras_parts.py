@@ -93,6 +93,8 @@ def test_acting_q_hat_and_evaluate_play_the_function_that_the_network_is(name):
     chosen = values[np.arange(len(states)), env.actions]
     np.testing.assert_allclose(chosen, values.max(axis=1), rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(run.q_hat_network(states), values, rtol=1e-5, atol=1e-5)
+    network.set_weights([0 * w for w in network.get_weights()])
+    np.testing.assert_allclose(run.q_hat_network(states), values, rtol=1e-5, atol=1e-5)  # it has weights of its own
 
 
 @pytest.mark.parametrize("name", ALL_NETWORKS)

@@ -39,7 +39,9 @@ def copy(network: keras.Model, states: np.ndarray | None = None) -> keras.Model:
     finalize_layers(second)
     for layer, copied in zip(all_layers(network), all_layers(second), strict=False):
         _carry_attributes(layer, copied)
+    _check_methods(network, second)
     check_is_equal("q_network cannot be copied for Q-hat", network, second, states)
+    _check_is_independent(network, second, states)
     if network in _made_here:
         _made_here.add(second)
     return second
@@ -50,6 +52,32 @@ def finalize_layers(network: keras.Model) -> None:
     for layer in all_layers(network):
         if hasattr(layer, "finalize_state"):
             layer.finalize_state()
+
+
+def _check_methods(network: keras.Model, second: keras.Model) -> None:
+    """ValueError if a `call` of the user's would be lost, which outputs for a few states may not show."""
+    layers = [network, *all_layers(network)], [second, *all_layers(second)]
+    for layer, copied in zip(*layers, strict=False):
+        if type(layer) is not type(copied) or "call" in vars(layer):
+            raise ValueError(
+                f"q_network cannot be copied for Q-hat: {layer.name!r} ({type(layer).__name__}) has a `call` of its "
+                "own that its copy would not have; put it into a layer of its own class"
+            )
+
+
+def _check_is_independent(network: keras.Model, second: keras.Model, states: np.ndarray | None) -> None:
+    """ValueError if the copy uses weights of the original, as by the closure of a Lambda layer."""
+    states = np.zeros((1, *network.input_shape[1:]), np.float32) + 0.5 if states is None else states
+    weights, before = network.get_weights(), second(states)
+    network.set_weights([w + 1 if np.issubdtype(w.dtype, np.floating) else w for w in weights])
+    after = second(states)
+    network.set_weights(weights)
+    again = second(states)
+    if not np.array_equal(before, after, equal_nan=True) and np.array_equal(before, again, equal_nan=True):
+        raise ValueError(
+            "q_network cannot be copied for Q-hat: a layer uses weights that are not its own, such as those in the "
+            "closure of a Lambda layer, so that Q-hat would follow Q"
+        )
 
 
 def _copy_layer(layer: keras.layers.Layer) -> keras.layers.Layer:
@@ -92,7 +120,8 @@ def _carry_attributes(layer: keras.layers.Layer, copied: keras.layers.Layer) -> 
     """What a configuration does not hold: numbers, arrays and functions that were set on the layer."""
     for name, value in vars(layer).items():
         is_plain = value is None or isinstance(value, bool | int | float | str | np.ndarray | np.generic | FunctionType)
-        is_an_array = tf.is_tensor(value) and hasattr(value, "numpy")
+        is_variable = isinstance(value, keras.Variable | tf.Variable)  # the copy has its own
+        is_an_array = tf.is_tensor(value) and hasattr(value, "numpy") and not is_variable
         is_its_own = name.lstrip("_") in ("name", "path", "build", "quantize", "auto_name")
         if (is_plain or is_an_array) and not is_its_own:
             vars(copied)[name] = value

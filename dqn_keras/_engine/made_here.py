@@ -16,6 +16,8 @@ def units_if_made_here(network: keras.Model) -> tuple[int, ...] | None:
     """
     if network not in _made_here or not is_relu_mlp(network):
         return None
+    if any(not w.trainable or w.regularizer or w.constraint for w in network.weights):
+        return None
     for layer in network.layers:
         added = (layer.kernel_regularizer, layer.bias_regularizer, layer.activity_regularizer)
         if any(added) or layer.kernel_constraint or layer.bias_constraint or not layer.trainable:

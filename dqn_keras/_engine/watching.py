@@ -7,8 +7,10 @@ microseconds, where tracing again takes a second.
 import functools
 import sys
 from collections.abc import Callable, Iterator
-from types import CodeType, FunctionType, MethodType, ModuleType
+from types import CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
 from typing import Any
+
+import numpy as np
 
 from dqn_keras._engine.tensorflow import keras
 
@@ -29,13 +31,15 @@ class Watch:
     """The state of some objects, as far as a trace can have read it.
 
     Seen are the attributes of Keras' objects and of the user's own, methods and attributes of the user's classes, and
-    of the user's functions the code, the closure and the global names they use, through any number of such steps. A
-    list or dict that is an attribute of a Keras object is taken for the same as long as it is the same object.
+    of the user's functions the code, the closure and the global names they use, through any number of such steps.
+    Containers and arrays of more than a thousand items are taken for the same as long as they are the same object, and
+    so are those in private attributes of Keras' objects, and a whole number is for an equal float.
     """
 
     def __init__(self, *parts: Any) -> None:
         self._looks: list[tuple[Callable[[], Any], Any]] = []
         self._visited: dict[int, Any] = {}
+        self._classes: set[type] = set()
         for part in parts:
             self._visit(part)
 
@@ -56,9 +60,19 @@ class Watch:
         elif isinstance(value, MethodType):
             self._visit(value.__func__)
             self._visit(value.__self__)
+        elif isinstance(value, functools.partial):
+            self._look(lambda: [value.func, *value.args, *value.keywords.values()])
+        elif isinstance(value, property | staticmethod | classmethod):
+            self._visit(value.fget if isinstance(value, property) else value.__func__)
+        elif isinstance(value, np.ndarray):
+            if value.size <= _LARGEST_CONTAINER:
+                self._looks.append((value.tobytes, value.tobytes()))
+        elif isinstance(value, keras.Variable):
+            self._look(lambda: [value.trainable, value.regularizer, value.constraint])
         elif isinstance(value, type):
-            if not is_of_a_library(value.__module__):
-                self._look(lambda: dict(vars(value)))
+            for base in value.__mro__:
+                if not is_of_a_library(base.__module__):
+                    self._visit_class(base)
         elif isinstance(value, list | tuple | set | frozenset | dict):
             if len(value) <= _LARGEST_CONTAINER:
                 self._look(lambda: dict(value) if isinstance(value, dict) else list(value))
@@ -66,13 +80,21 @@ class Watch:
             self._visit(type(value))
             attributes = vars(value)
             self._looks.append((lambda: attributes, dict(attributes)))
-            for attribute in attributes.values():
-                if not isinstance(attribute, list | dict | tuple | set):  # which Keras keeps its books in
-                    self._visit(attribute)
-        elif not isinstance(value, ModuleType) and not is_of_a_library(type(value).__module__):
+            is_users = not is_of_a_library(type(value).__module__)
+            for name, attribute in attributes.items():
+                if not isinstance(attribute, list | dict | tuple | set) or (is_users and name[0] != "_"):
+                    self._visit(attribute)  # in other containers Keras keeps its books
+        elif isinstance(value, SimpleNamespace) or not (
+            isinstance(value, ModuleType) or is_of_a_library(type(value).__module__)
+        ):
             self._visit(type(value))
             if hasattr(value, "__dict__"):
                 self._look(lambda: dict(vars(value)))
+
+    def _visit_class(self, value: type) -> None:
+        if value not in self._classes:
+            self._classes.add(value)
+            self._look(lambda: dict(vars(value)))
 
     def _look(self, look: Callable[[], list | dict]) -> None:
         seen = look()

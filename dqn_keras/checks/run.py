@@ -48,10 +48,12 @@ def check_own_parts(
     """The formulas to learn by; TypeError, ValueError or a warning for what cannot be used, or not as it is meant."""
     if optimizer is not None:
         check_optimizer(optimizer)
-    owners = None if q_network is None else owners_optimizer(q_network)
+    owners = owners_optimizer(q_network)
     if owners is not None:
         if loss is None:
             loss = getattr(q_network, "loss", None)
+            if isinstance(loss, list | tuple | dict):
+                raise ValueError(f"q_network must be compiled with one loss, got {loss!r}; or give train a loss")
         config_of_compile = arguments_of_compile(q_network)
         ignored = [x for x in ("metrics", "weighted_metrics", "loss_weights") if config_of_compile.get(x)]
         if ignored:

@@ -9,6 +9,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Generator, Hashable, Sequence
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -146,9 +147,9 @@ def _bind_program(
 
 
 def _constants(cls: type) -> Hashable:
-    """The numbers of an environment of this package, which may be changed to try out another physics."""
+    """Numbers and methods of an environment of this package, which may be changed to try out another physics."""
     named = vars(sys.modules[cls.__module__]) | vars(cls)
-    return tuple((name, x) for name, x in named.items() if isinstance(x, int | float))
+    return tuple((name, x) for name, x in named.items() if isinstance(x, int | float | FunctionType))
 
 
 _FAULTS = ("nothing", "an observation", "a reward", "the loss or a weight")

@@ -12,7 +12,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from types import FunctionType
+from types import FunctionType, MethodType
 from typing import Any
 
 import gymnasium as gym
@@ -89,7 +89,11 @@ def _describe_network(network: keras.Model) -> str:
 
 def _describe_layer(layer: keras.layers.Layer) -> Any:
     """What the layer's configuration does not hold: arrays, as Normalization keeps them, and what is the user's."""
-    arrays = {name: _plain(x) for name, x in vars(layer).items() if isinstance(x, np.ndarray) or hasattr(x, "numpy")}
+    arrays = {
+        name: _plain(x)
+        for name, x in vars(layer).items()
+        if isinstance(x, np.ndarray) or (tf.is_tensor(x) and not isinstance(x, keras.Variable | tf.Variable))
+    }
     functions = {
         name: _describe_part("q_network", value)
         for name, value in vars(layer).items()
@@ -112,23 +116,34 @@ def _describe_part(argument: str, part: Any) -> Any:
     """A function, a class of Keras' or the user's with its settings, or anything else that JSON can hold."""
     if isinstance(part, functools.partial):
         return [_describe_part(argument, x) for x in (part.func, list(part.args), part.keywords)]
+    if isinstance(part, MethodType):
+        return [_describe_code(argument, part.__func__), _describe_part(argument, part.__self__)]
+    if hasattr(part, "python_function"):  # a tf.function
+        return _describe_part(argument, part.python_function)
     if isinstance(part, FunctionType | type):
         return _describe_code(argument, part)
     if isinstance(part, keras.Variable):
         return _plain(part.numpy())
-    if isinstance(part, list | tuple | set | frozenset):
-        return [_describe_part(argument, x) for x in (sorted(part) if isinstance(part, set | frozenset) else part)]
+    if isinstance(part, list | tuple):
+        return [_describe_part(argument, x) for x in part]
     if isinstance(part, dict):
         return {str(name): _describe_part(argument, x) for name, x in part.items()}
-    if isinstance(part, keras.Optimizer):
-        settings = {name: x for name, x in vars(part).items() if _is_a_setting(name, x)}
-    elif hasattr(part, "__dict__"):
-        is_library = is_of_a_library(type(part).__module__)
-        settings = {name: x for name, x in vars(part).items() if _is_data(x) or not is_library}
-    else:
+    if not hasattr(part, "__dict__"):
         return _plain(part)
-    settings = {name: _describe_part(argument, x) for name, x in sorted(settings.items())}
+    settings = {
+        name: _describe_part(argument, x)
+        for name, x in sorted(vars(part).items())
+        if name not in ("name", "built", "_lock") and _is_a_setting(name, x)
+    }
     return {"class": _describe_code(argument, type(part)), **settings}
+
+
+def _is_a_setting(name: str, value: Any) -> bool:
+    """Of an object's attributes: numbers and the like, and what is the user's; not the books that Keras keeps."""
+    if isinstance(value, FunctionType | type):
+        return not is_of_a_library(value.__module__)
+    is_users = not is_of_a_library(type(value).__module__)
+    return name in ("_learning_rate", "inner_optimizer") or is_users or _is_data(value)
 
 
 def _is_data(value: Any) -> bool:
@@ -139,16 +154,12 @@ def _is_data(value: Any) -> bool:
     return value is None or isinstance(value, bool | int | float | str | np.ndarray | np.generic)
 
 
-def _is_a_setting(name: str, value: Any) -> bool:
-    """Of an optimizer's attributes: not its name, its variables and the books that it keeps of them."""
-    if isinstance(value, set | list | tuple):  # names excluded from weight decay; variables are excluded by their ids
-        return "exclude" in name and all(isinstance(x, str) for x in value)
-    is_part = name in ("_learning_rate", "inner_optimizer")
-    return is_part or (_is_data(value) and name not in ("name", "built", "_lock"))
-
-
 def _describe_code(argument: str, code: Any) -> Any:
-    """The name of a function or class, and if it is the user's a digest of its source and the numbers it reads."""
+    """The name of a function or class; if it is the user's, its source and what it reads, too.
+
+    Raises:
+        ValueError: it has no name by which it could be imported.
+    """
     module, name = code.__module__ or "", code.__qualname__
     full_name = f"{module}.{name}"
     if is_of_a_library(module):
@@ -162,23 +173,36 @@ def _describe_code(argument: str, code: Any) -> Any:
             f"{argument} must have a name that can be imported, since the checkpoint keeps it; {full_name} has none: "
             "define it with `def` or `class` at the top level of a module, a script or a notebook"
         )
+    digest, read = _read_in(code, {})
+    return [full_name, digest, read]
+
+
+def _read_in(code: Any, met: dict[Any, str]) -> tuple[str, dict[str, Any]]:
+    """A digest of the source of a user's function or class and all such that it uses; the numbers they read."""
+    met[code] = ""
     try:
         source = inspect.getsource(code)
     except (OSError, TypeError):  # typed in where no source is kept
         source = repr(_bytecode(code))
-    reads = {}
-    if isinstance(code, FunctionType):
-        reads = {name: x for name, x in read_by(code).items() if isinstance(x, bool | int | float | str)}
-    return [full_name, hashlib.sha256(source.encode()).hexdigest()[:12], reads]
+    is_class = isinstance(code, type)
+    functions = [x for x in vars(code).values() if isinstance(x, FunctionType)] if is_class else [code]
+    used: list[Any] = list(code.__bases__) if is_class else []
+    numbers = {k: _plain(x) for k, x in vars(code).items() if k[:2] != "__" and _is_data(x)} if is_class else {}
+    for function in functions:
+        values = {**read_by(function), "defaults": function.__defaults__}
+        numbers |= {name: _plain(x) for name, x in values.items() if x is not None and _is_data(x)}
+        used += [x for x in values.values() if isinstance(x, FunctionType | type)]
+    for other in used:
+        if other not in met and not is_of_a_library(other.__module__):
+            more, read = _read_in(other, met)
+            source, numbers = source + more, {**read, **numbers}
+    return hashlib.sha256(source.encode()).hexdigest()[:12], numbers
 
 
 def _bytecode(code: Any) -> Any:
     if isinstance(code, FunctionType):
-        return (
-            code.__code__.co_code,
-            code.__code__.co_names,
-            [repr(x) for x in code.__code__.co_consts if not hasattr(x, "co_code")],
-        )
+        constants = [repr(x) for x in code.__code__.co_consts if not hasattr(x, "co_code")]
+        return code.__code__.co_code, code.__code__.co_names, constants
     return {name: _bytecode(x) for name, x in sorted(vars(code).items()) if isinstance(x, FunctionType)}
 
 
@@ -189,7 +213,7 @@ def describe(env: gym.Env | FuncEnv) -> dict[str, Any]:
     """
     wrappers: list[Any] = []
     if isinstance(env, FuncEnv):
-        name, arguments = f"{type(env).__name__} (functional)", vars(env)
+        name, arguments = f"{type(env).__name__} (functional)", {**_class_attributes(env), **vars(env)}
     else:
         wrapper = env
         while isinstance(wrapper, gym.Wrapper):
@@ -211,21 +235,31 @@ def describe(env: gym.Env | FuncEnv) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def _class_attributes(env: FuncEnv) -> dict[str, Any]:
+    """Numbers and the like that the classes of a user's environment hold."""
+    classes = [cls for cls in reversed(type(env).__mro__) if not is_of_a_library(cls.__module__)]
+    return {name: x for cls in classes for name, x in vars(cls).items() if name[:2] != "__" and _is_data(x)}
+
+
+def _plain(value: Any, depth: int = 3) -> Any:
     """Something that JSON holds, equal for equal values; of what has no plain value, its type."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, dict):
-        return {str(key): _plain(x) for key, x in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [_plain(x) for x in value]
+        return {str(key): _plain(x, depth) for key, x in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(x, depth) for x in value]
+    if isinstance(value, set | frozenset):  # whose order differs from process to process
+        return sorted((_plain(x, depth) for x in value), key=repr)
     if isinstance(value, functools.partial):
-        return [_plain(value.func), _plain(value.args), _plain(value.keywords)]
+        return [_plain(value.func, depth), _plain(value.args, depth), _plain(value.keywords, depth)]
     if tf.is_tensor(value) or isinstance(value, np.ndarray):
         array = np.asarray(value)
         return [str(array.dtype), list(array.shape), hashlib.sha256(array.tobytes()).hexdigest()]
+    if not hasattr(value, "__qualname__") and not is_of_a_library(type(value).__module__) and depth:
+        return [type(value).__qualname__, _plain(getattr(value, "__dict__", {}), depth - 1)]
     return getattr(value, "__qualname__", type(value).__qualname__)
 
 
