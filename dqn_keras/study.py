@@ -111,7 +111,8 @@ def study(
         engine: "joblib", processes on this machine; or "ray", tasks on the Ray cluster that this process is connected
             to, or else on this machine (needs the extra `ray`); a task whose worker dies is tried again.
         num_workers: processes of joblib; by default as many as there are cores. With 1 all is done in this process.
-            (Ray has as many as its cluster has cores.)
+            (Ray has as many as its cluster has cores.) Other processes import modules themselves: they see what a
+            notebook or script defines, but not what it has changed in a module that it imports.
         verbose: 1 shows a progress bar, 0 nothing.
 
     Raises:

@@ -164,7 +164,7 @@ def train(
     if checkpoints:
         resumed_from = checkpoints.begin(agent, seed, resume)
         if verbose and resume:
-            print(f"Resumed at episode {len(agent.episodes)} from {resumed_from}" if resumed_from else "Starting anew")
+            print(f"Resumed at episode {len(agent.episodes)} from {resumed_from}" if resumed_from else "A new run")
     run = Run(config, agent, steps_per_second=[math.nan] * len(agent.episodes))
 
     episodes_per_call = 100 if checkpoints is None else min(100, checkpoint_every)
@@ -226,7 +226,7 @@ def _play_until_over(
 
 
 def _timed(episodes: Iterator[Episode], run: Run) -> Generator[Episode, None, None]:
-    """The same episodes; the speed of each is noted. Those that are played in one call have that of the call."""
+    """Notes the speed of each episode; the episodes that one call plays all get the speed of the call."""
     while True:
         start = time.perf_counter()
         episode = next(episodes, None)

@@ -15,7 +15,7 @@ from dqn_keras.replay import Experience
 def as_batch(experiences: Sequence[Any], state_shape: tuple[int, ...], num_actions: int) -> Experience:
     """Any five arrays as tensors of the right dtypes; an error that names the field if one cannot be that.
 
-    A reward of shape [B, 1] would otherwise broadcast against [B] to a loss over [B, B], without a word. Values are
+    A reward of shape [B, 1] would otherwise silently broadcast against [B] to a loss over [B, B]. Values are
     checked where there are any: inside a tf.function there are not.
     """
     if len(experiences) != len(_PLURALS):

@@ -51,7 +51,8 @@ class Checkpoints:
         """Brings the agent to where the run is, and has a file there before any work starts; the file it is from."""
         if not resume and (paths := self.paths()):
             raise ValueError(
-                f"checkpoint {paths[0]} is there already; resume=True goes on from it, another folder starts anew"
+                f"checkpoint {paths[0]} is there already; resume=True continues that run, "
+                "a new run needs another folder"
             )
         path = self.restore(agent, seed) if resume else None
         if path is None:
@@ -144,7 +145,7 @@ def _variables(agent: Agent) -> dict[str, keras.Variable]:
 
 
 def _facts(agent: Agent) -> dict[str, Any]:
-    """All that is not."""
+    """The rest of the state, which is no array."""
     return {
         "seed": agent.seed,
         "num_episodes": len(agent.episodes),
