@@ -1,9 +1,9 @@
 """Compiled programs: those of the package's own networks are shared, everything else is traced as it is.
 
 TensorFlow traces a function for the variables that it names, and what XLA compiles from the trace is never freed: a
-second agent would cost seconds of compilation and megabytes that stay. So a program for networks that the package made, which
-it knows all of, is traced on a *stand-in* of the same sizes, and then called with any agent's variables in their place.
-A network or optimizer of the user's is never rebuilt: its program is traced on the objects themselves.
+second agent would cost seconds of compilation and megabytes that stay. So a program for networks that the package made,
+which it knows all of, is traced on a *stand-in* of the same sizes, and then called with any agent's variables in their
+place. A network or optimizer of the user's is never rebuilt: its program is traced on the objects themselves.
 """
 
 import contextlib
