@@ -286,7 +286,9 @@ def test_a_longer_run_that_is_refused_changes_nothing():
 
 
 def test_nobody_reading_is_no_traceback():
-    script = f"{sys.executable} -m dqn_keras train CartPole-v1 --seed 3 --out a --num-episodes 500 | head -1"
+    script = (
+        f"{shlex.quote(sys.executable)} -m dqn_keras train CartPole-v1 --seed 3 --out a --num-episodes 500 | head -1"
+    )
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True)
     assert done.stdout.count("\n") == 1
     assert done.stderr == "dqn-keras: nobody reads the output. To go on: dqn-keras resume a\n"

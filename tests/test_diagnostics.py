@@ -31,7 +31,7 @@ def test_the_metrics_are_those_of_the_batch_before_the_step_by_the_targets_in_us
 
     learner = Learner(*networks, keras.optimizers.Adam())
     learner.prepare()
-    formulas = Formulas(double_td_targets) if is_double else DEFAULT_FORMULAS
+    formulas = Formulas(double_td_targets, "mse") if is_double else DEFAULT_FORMULAS
     metrics = checked_step(as_batch(batch, (4,), 2), learner, 0.95, 0.01, formulas)
     expected = Metrics(np.mean(errors**2), best.mean(), best.max(), np.abs(errors).mean())
     np.testing.assert_allclose(metrics, expected, rtol=1e-4)
