@@ -27,6 +27,7 @@ from dqn_keras.checks.environments import CheckedEnv, check_functional
 from dqn_keras.environments import CartPole
 from dqn_keras.loops import compiled
 from dqn_keras.storage.checkpoint import Checkpoints
+from dqn_keras.storage.identity import identity
 from tests import faults
 from tests.test_config import bad_fields, refused
 
@@ -84,7 +85,7 @@ def cost_of_checks() -> dict[str, str]:
         whole = (time.perf_counter() - start) / run.agent.memory.num_appended * 1e6
     seconds = []
     with tempfile.TemporaryDirectory() as folder:
-        checkpoints = Checkpoints(folder, env, config)
+        checkpoints = Checkpoints(folder, identity(env, config, run.agent))
         for _ in range(20):
             start = time.perf_counter()
             checkpoints.save(run.agent)

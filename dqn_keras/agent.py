@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -53,16 +53,19 @@ def make_agent(
     seed: int,
     q_network: keras.Model | None = None,
     optimizer: keras.Optimizer | None = None,
+    loss: str | Callable = "mse",
     some_states: np.ndarray | None = None,
     dtype: Any = np.float32,
 ) -> Agent:
     """An agent that has seen nothing.
 
     Weights and random stream follow from `seed` alone, but for the weights of a network that is given. That learns
-    with its owner's optimizer if it was compiled, and `some_states` [B, *S] are what its copy is compared on.
+    with its owner's optimizer if it was compiled, or else is compiled with `loss`. `some_states` [B, *S] are what its
+    copy is compared on.
     """
     sizes = (*state_shape, *config.hidden_units, num_actions)
-    if q_network is None and optimizer is None and (learner := _recycled.pop(sizes, None)):
+    is_default = q_network is None and optimizer is None and loss == "mse"
+    if is_default and (learner := _recycled.pop(sizes, None)):
         _renew(learner, config, seed)
     else:
         if q_network is None:
@@ -71,7 +74,7 @@ def make_agent(
         else:
             networks = q_network, copy(q_network, some_states)
             optimizer = optimizer or owners_optimizer(q_network)
-        learner = Learner(*networks, _optimizer_for(networks[0], optimizer, config))
+        learner = Learner(*networks, _optimizer_for(networks[0], optimizer, loss, config))
         learner.prepare()
     return Agent(
         seed=seed,
@@ -84,28 +87,36 @@ def make_agent(
     )
 
 
-_compiled_here: weakref.WeakKeyDictionary[keras.Model, keras.Optimizer] = weakref.WeakKeyDictionary()
+_compiled_with_our_adam: weakref.WeakKeyDictionary[keras.Model, keras.Optimizer] = weakref.WeakKeyDictionary()
 
 
 def owners_optimizer(q_network: keras.Model | None) -> keras.Optimizer | None:
-    """The optimizer that the network was compiled with by whoever made it; None if it was not, or only here."""
-    if q_network is None or not q_network.compiled or q_network.optimizer is _compiled_here.get(q_network):
+    """The optimizer that the network was compiled with, if somebody chose it; None for none, or for our own Adam."""
+    if q_network is None or not q_network.compiled or q_network.optimizer is _compiled_with_our_adam.get(q_network):
         return None
     return q_network.optimizer
 
 
-def _optimizer_for(q_network: keras.Model, optimizer: keras.Optimizer | None, config: Config) -> keras.Optimizer:
-    """The given one, or else Adam. A network that its owner has not compiled is compiled with it.
+def _optimizer_for(
+    q_network: keras.Model, optimizer: keras.Optimizer | None, loss: str | Callable, config: Config
+) -> keras.Optimizer:
+    """The given one, or else Adam. A network that its owner has not compiled is compiled with it and with the loss.
 
-    Keras' callbacks and .keras files look for the optimizer there.
+    Keras' callbacks and .keras files look for both there.
     """
-    if optimizer is None or owners_optimizer(q_network) is None:
-        is_adam_of_ours = optimizer is None
-        optimizer = optimizer or keras.optimizers.Adam(learning_rate=config.alpha, name="adam")
-        # In mixed precision, Keras puts a LossScaleOptimizer around it, as it does for `model.fit`.
-        q_network.compile(optimizer=optimizer, loss="mse", auto_scale_loss=is_adam_of_ours)
-        _compiled_here[q_network] = optimizer = q_network.optimizer
-    return optimizer
+    if optimizer is not None:
+        if owners_optimizer(q_network) is None:
+            q_network.compile(optimizer=optimizer, loss=loss, auto_scale_loss=False)
+        return optimizer
+    # In mixed precision, Keras puts a LossScaleOptimizer around it, as it does for `model.fit`.
+    q_network.compile(optimizer=keras.optimizers.Adam(learning_rate=config.alpha, name="adam"), loss=loss)
+    _compiled_with_our_adam[q_network] = q_network.optimizer
+    return q_network.optimizer
+
+
+def keeps_averages(optimizer: keras.Optimizer) -> bool:
+    """Whether it averages the weights, and puts the averages in their place at the end."""
+    return getattr(getattr(optimizer, "inner_optimizer", optimizer), "use_ema", False)
 
 
 @contextlib.contextmanager

@@ -1,7 +1,7 @@
 """Keras callbacks in a run: an episode is to them an epoch of one batch."""
 
 import math
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from dqn_keras._engine.tensorflow import keras
@@ -13,11 +13,15 @@ if TYPE_CHECKING:
 
 
 def with_callbacks(
-    episodes: Iterator[Episode], run: "Run", callbacks: Sequence[keras.callbacks.Callback]
+    episodes: Iterator[Episode],
+    run: "Run",
+    callbacks: Sequence[keras.callbacks.Callback],
+    before_end: Callable[[], None],
 ) -> Generator[Episode, None, None]:
-    """The same episodes, each told to the callbacks, until one of them asks to stop.
+    """Yields the same episodes and tells each to the callbacks, until one of them asks to stop.
 
-    TerminateOnNaN asks for it when learning has diverged, which is then no error.
+    TerminateOnNaN asks for it when learning has diverged, which is then no error. `before_end` is called before the
+    callbacks' `on_train_end`.
     """
     network, log, num_episodes = run.q_network, Log(run.config), run.config.num_episodes
     network.stop_training = False
@@ -40,6 +44,7 @@ def with_callbacks(
             if network.stop_training:
                 return
     finally:
+        before_end()
         listeners.on_train_end()
 
 

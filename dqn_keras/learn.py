@@ -79,6 +79,12 @@ def update_q_hat(q_network: keras.Model, q_hat_network: keras.Model, tau: Any = 
 DEFAULT_FORMULAS = Formulas(td_targets, "mse")
 
 
+def packages(formulas: Formulas) -> Formulas | None:
+    """The formulas if they are this package's and Keras', which do not change while a process lives; else None."""
+    are_known = any(formulas.targets is x for x in (td_targets, double_td_targets)) and isinstance(formulas.loss, str)
+    return formulas if are_known else None
+
+
 class Metrics(NamedTuple):
     """What an update's batch was like, before the update; float32 scalars."""
 
@@ -170,8 +176,9 @@ def learn(
             learner.prepare()
         batch = as_batch(experiences, q_network.input_shape[1:], q_network.output_shape[-1])
         return gradient_step(batch, as_share("gamma", gamma), *learner, tau, formulas).loss
-    step = compiled_step(partial(_make_step, formulas), learner, formulas, jit_compile)
     batch = as_batch(experiences, q_network.input_shape[1:], q_network.output_shape[-1])
+    make_step, batch_size = partial(_make_step, formulas), batch.reward.shape[0]
+    step = compiled_step(make_step, learner, formulas, packages(formulas), batch_size, jit_compile)
     return step(*batch, as_share("gamma", gamma), as_share("tau", tau))[0]
 
 

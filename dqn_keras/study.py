@@ -29,7 +29,7 @@ from dqn_keras.checks.run import check_arguments
 from dqn_keras.config import Config
 from dqn_keras.progress import tqdm
 from dqn_keras.storage.files import FORMAT, from_bytes, replacing, to_bytes
-from dqn_keras.storage.identity import check_is_same, identity, warn_of_other_versions
+from dqn_keras.storage.identity import check_is_same, identity_of_study, warn_of_other_versions
 from dqn_keras.training import train
 
 
@@ -125,7 +125,7 @@ def study(
     if engine not in _ENGINES:
         raise ValueError(f"engine must be one of {', '.join(_ENGINES)}, got {engine!r}")
     num_workers = cpu_count() if num_workers is None else check_count("num_workers", num_workers)
-    facts = {"format": FORMAT, **identity(env, config)}
+    facts = {} if file is None else {"format": FORMAT, **identity_of_study(env, config)}
     outcomes = {} if file is None else _load(Path(file), facts)
 
     missing = [seed for seed in seeds if seed not in outcomes]

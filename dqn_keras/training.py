@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import math
 import os
 import time
@@ -13,7 +14,7 @@ import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras._engine.tensorflow import keras
-from dqn_keras.agent import Agent, make_agent, optimizer_shown, owners_optimizer
+from dqn_keras.agent import Agent, keeps_averages, make_agent, optimizer_shown, owners_optimizer
 from dqn_keras.callbacks import with_callbacks
 from dqn_keras.checks.environments import CheckedEnv, Spaces, check_environment, some_states
 from dqn_keras.checks.formulas import Formulas
@@ -27,6 +28,7 @@ from dqn_keras.metrics import Episode, history
 from dqn_keras.progress import Progress
 from dqn_keras.seeding import checked_seed
 from dqn_keras.storage.checkpoint import Checkpoints
+from dqn_keras.storage.identity import identity
 from dqn_keras.storage.networks import save_agent
 
 
@@ -153,15 +155,15 @@ def train(
         raise ValueError("resume needs a folder to resume from: checkpoint, got None")
     spaces = check_environment(env, q_network)
     formulas = check_own_parts(config, q_network, optimizer, targets, loss)
+    some = some_states(env.observation_space, spaces.state_dtype)
+    sizes = spaces.state_shape, spaces.num_actions
+    seed_in_use = checked_seed(seed)
+    agent = make_agent(*sizes, config, seed_in_use, q_network, optimizer, formulas.loss, some, spaces.state_dtype)
     checkpoints = None
     if checkpoint is not None:
         in_use = optimizer or owners_optimizer(q_network)
-        checkpoints = Checkpoints(checkpoint, env, config, q_network, in_use, formulas, checkpoint_every)
-
-    some = some_states(env.observation_space, spaces.state_dtype)
-    sizes = spaces.state_shape, spaces.num_actions
-    agent = make_agent(*sizes, config, checked_seed(seed), q_network, optimizer, some, spaces.state_dtype)
-    if checkpoints:
+        saved_as = identity(env, config, agent, formulas, q_network, in_use)
+        checkpoints = Checkpoints(checkpoint, saved_as, checkpoint_every)
         resumed_from = checkpoints.begin(agent, seed, resume)
         if verbose and resume:
             print(f"Resumed at episode {len(agent.episodes)} from {resumed_from}" if resumed_from else "A new run")
@@ -169,15 +171,15 @@ def train(
 
     episodes_per_call = 100 if checkpoints is None else min(100, checkpoint_every)
     played = _timed(_episodes(env, spaces, run, formulas, callbacks, episodes_per_call), run)
+    finish = _finisher(run, checkpoints)
     if callbacks:
-        played = with_callbacks(played, run, callbacks)
+        played = with_callbacks(played, run, callbacks, before_end=finish)
     with Progress(run, verbose) as progress, stop_requests() as is_asked_to_stop, optimizer_shown(agent):
         _play_until_over(run, played, progress, checkpoints, is_asked_to_stop)
-        if checkpoints and not run.diverged:
+        finish()
+        if checkpoints and not run.diverged and not keeps_averages(agent.optimizer):
             checkpoints.save_the_end(agent, has_callbacks=bool(callbacks))
         run.interrupted = is_asked_to_stop()
-    if agent.num_updates:  # as `fit` does: if the optimizer keeps averages, they are the result
-        agent.optimizer.finalize_variable_values(agent.q_network.trainable_variables)
     progress.show_end(checkpoints.folder if checkpoints else None)
     if not (agent.num_updates or run.interrupted or run.diverged):
         warnings.warn(
@@ -202,6 +204,23 @@ def _episodes(
     # A callback may change the agent between episodes, and sees it as it then is.
     only_logs = all(type(callback) is keras.callbacks.CSVLogger for callback in callbacks)
     return compiled.episodes(env, spaces, run.agent, run.config, episodes_per_call if only_logs else 1, formulas)
+
+
+def _finisher(run: Run, checkpoints: Checkpoints | None) -> Callable[[], None]:
+    """A function that makes the averages of the weights the result, as `fit` does, if the optimizer keeps them.
+
+    The checkpoint holds the weights themselves, which a resumed run learns on with. A second call does nothing.
+    """
+
+    @functools.cache
+    def finish() -> None:
+        optimizer = run.agent.optimizer
+        if checkpoints and not run.diverged and keeps_averages(optimizer):
+            checkpoints.save_the_end(run.agent, has_callbacks=False)
+        if run.agent.num_updates:
+            optimizer.finalize_variable_values(run.q_network.trainable_variables)
+
+    return finish
 
 
 def _play_until_over(

@@ -21,6 +21,7 @@ from dqn_keras.environments import CartPole
 from dqn_keras.storage import checkpoint, files
 from dqn_keras.storage.checkpoint import Checkpoints
 from dqn_keras.storage.files import from_bytes, to_bytes
+from dqn_keras.storage.identity import identity
 
 LOOPS = {"Gymnasium loop": lambda: gym.make("CartPole-v1"), "compiled episodes": CartPole}
 CONFIG = Config(num_episodes=250, batch_size=32, memory_size=2_000, solved_reward=1e6)  # its memory goes round
@@ -213,10 +214,10 @@ def corruption_campaign(folder, number, seed=0):
         newest(source).write_bytes(content)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            path = Checkpoints(source, env, config).restore(agent, SEED)
+            path = Checkpoints(source, identity(env, config, agent)).restore(agent, SEED)
         said = [str(w.message) for w in caught]
         is_told = len(said) == 1 and str(newest(source)) in said[0] and f"goes on from the older {older}" in said[0]
-        restored = checkpoint._arrays(agent)
+        restored = checkpoint._arrays(agent, [])
         is_older = all(np.array_equal(restored[k], v, equal_nan=True) for k, v in expected.items())
         if path != older or not is_told or not is_older:
             silent.append((way, path, said))
@@ -235,7 +236,7 @@ def forgetting_campaign(loop, folder):
     play(loop, folder / "half", config=half)
     arrays, facts = from_bytes(newest(folder / "half").read_bytes())
     fresh = make_agent((4,), 2, run.config, SEED)
-    start_arrays, start_facts = checkpoint._arrays(fresh), checkpoint._facts(fresh)
+    start_arrays, start_facts = checkpoint._arrays(fresh, []), checkpoint._facts(fresh)
     start_facts["rng"] = np.random.default_rng(0).bit_generator.state
     start_facts["seed"] = 0
 

@@ -458,8 +458,8 @@ def test_alpha_and_an_optimizer_that_say_different_things_are_refused(cartpole):
 
 def test_parts_of_compile_that_are_not_used_are_named(cartpole):
     network = NETWORKS["dense"]()
-    network.compile("adam", loss="mse", metrics=["mae"])
-    with pytest.warns(UserWarning, match=r"^metrics of q_network.compile are not used by train"):
+    network.compile("adam", loss="mse", metrics=["mae"], run_eagerly=True)
+    with pytest.warns(UserWarning, match=r"^metrics, run_eagerly of q_network.compile are not used by train"):
         train(cartpole, QUICK, q_network=network, verbose=0)
 
 
@@ -475,6 +475,17 @@ WRONG = {
         r"^loss must return a scalar tensor, or one",
     ),
     "a loss that is no tensor": ({"loss": lambda y, q: None}, ValueError, r"^loss must return .*, got None"),
+    "targets of two arguments": (
+        {"targets": lambda batch, gamma: batch.reward},
+        TypeError,
+        r"^targets must be a function of \(experiences, gamma, q_network, q_hat_network\), got .*: too many",
+    ),
+    "a loss of one argument": ({"loss": lambda y: y}, TypeError, r"^loss must be a function of \(y, q\), got .*: too"),
+    "a loss without q": (
+        {"loss": lambda y, q: tf.reduce_mean(y)},
+        ValueError,
+        r"^loss must depend on q by operations that TensorFlow can differentiate",
+    ),
     "targets for every action": (
         {"targets": lambda batch, gamma, q, q_hat: q_hat(batch.next_state)},
         ValueError,
@@ -556,6 +567,10 @@ REFUSED = {
         "must have one input, got 2",
     ),
     "float64": (in_float64, "must give float32 values, got float64"),
+    "a dictionary of outputs": (
+        lambda: keras.Model(a := keras.Input((4,)), {"q": dense(2)(a)}),
+        r"must give Q-values of shape \[B, A\]",
+    ),
     "a sequence of values": (
         lambda: keras.Sequential([keras.Input((4, 1)), dense(2)]),
         r"must give Q-values of shape \[B, A\]",
@@ -648,115 +663,6 @@ def test_transitions_are_counted_beyond_32_bits():
         prints.append(weights_of(agent.q_network, agent.q_hat_network))
         assert agent.num_updates > 0
     np.testing.assert_array_equal(*prints)
-
-
-# What a checkpoint knows them by
-
-
-def doubled(scale, y, q):
-    return scale * tf.reduce_mean(tf.square(y - q))
-
-
-def own_targets(experiences, gamma, q_network, q_hat_network):
-    return td_targets(experiences, gamma, q_network, q_hat_network)
-
-
-def test_functions_without_a_name_are_refused_for_a_checkpoint(tmp_path, cartpole):
-    def local(y, q):
-        return tf.reduce_mean(tf.square(y - q))
-
-    for own in (
-        {"loss": lambda y, q: tf.reduce_mean(tf.square(y - q))},
-        {"loss": local},
-        {"loss": functools.partial(local)},
-        {"targets": lambda *arguments: td_targets(*arguments)},
-        {"q_network": sequential(dense(8, lambda x: tf.sin(x)))},
-        {"optimizer": keras.optimizers.SGD(lambda: 0.1)},
-    ):
-        (name,) = own
-        with pytest.raises(ValueError, match=rf"^{name} must have a name that can be imported, .*`def`"):
-            train(cartpole, QUICK, seed=0, checkpoint=tmp_path / "run", verbose=0, **own)
-    assert not (tmp_path / "run").exists()
-
-
-SAME_OR_NOT = {
-    "loss": [
-        "huber",
-        "mse",
-        scaled_loss,
-        keras.losses.Huber(0.5),
-        keras.losses.Huber(2.0),
-        functools.partial(doubled, 1.0),
-        functools.partial(doubled, 2.0),
-    ],
-    "targets": [td_targets, double_td_targets, own_targets],
-    "optimizer": [
-        lambda: keras.optimizers.SGD(0.1),
-        lambda: keras.optimizers.SGD(0.2),
-        lambda: keras.optimizers.SGD(0.1, clipnorm=1.0),
-        lambda: keras.optimizers.Adam(keras.optimizers.schedules.ExponentialDecay(0.1, 1, 0.5)),
-        lambda: keras.optimizers.Adam(keras.optimizers.schedules.ExponentialDecay(0.1, 1, 0.6)),
-        lambda: keras.optimizers.Adam(parts.HalvingSchedule()),
-        lambda: parts.SignDescent(1.0),
-        lambda: parts.SignDescent(2.0),
-        lambda: keras.optimizers.AdamW(0.1),
-        parts.excluding,
-    ],
-    "q_network": [
-        NETWORKS["dense"],
-        NETWORKS["Normalization, adapted"],
-        NETWORKS["Normalization, given"],
-        NETWORKS["an activation of one's own"],
-        NETWORKS["a layer with an attribute set later"],
-        lambda: sequential(dense(8, "relu"), parts.Scaled()),
-    ],
-}
-
-
-@pytest.mark.parametrize("slot", SAME_OR_NOT)
-def test_a_run_is_resumed_with_the_same_parts_and_with_no_others(slot, tmp_path, cartpole):
-    def go_on(part, folder, resume=True):
-        own = part() if slot in ("optimizer", "q_network") else part
-        return train(cartpole, QUICK, seed=0, checkpoint=folder, resume=resume, verbose=0, **{slot: own})
-
-    choices = SAME_OR_NOT[slot]
-    for i, part in enumerate(choices):
-        go_on(part, tmp_path / str(i), resume=False)
-        go_on(part, tmp_path / str(i))
-        with pytest.raises(ValueError, match=rf"^{slot} is "):
-            go_on(choices[i - 1], tmp_path / str(i))
-
-
-def test_another_source_under_the_same_name_is_noticed(tmp_path, cartpole, monkeypatch):
-    module = __import__(__name__, fromlist="_")
-    train(cartpole, QUICK, seed=0, loss=scaled_loss, checkpoint=tmp_path, verbose=0)
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "FACTOR", 100.0)
-        with pytest.raises(ValueError, match=r'^loss is .*"FACTOR": 1.0.*, got .*"FACTOR": 100.0'):
-            train(cartpole, QUICK, seed=0, loss=scaled_loss, checkpoint=tmp_path, resume=True, verbose=0)
-
-    def scaled_again(y, q):
-        return 100.0 * tf.reduce_mean(tf.square(y - q))
-
-    scaled_again.__qualname__ = "scaled_loss"
-    monkeypatch.setattr(module, "scaled_loss", scaled_again)
-    with pytest.raises(ValueError, match=r"^loss is "):
-        train(cartpole, QUICK, seed=0, loss=scaled_again, checkpoint=tmp_path, resume=True, verbose=0)
-
-
-@BOTH_LOOPS
-def test_a_run_with_own_parts_is_resumed_bit_for_bit(make_env, tmp_path):
-    def run(num_episodes, **more):
-        config = Config(num_episodes=num_episodes, batch_size=8, solved_reward=1e6)
-        optimizer = keras.optimizers.AdamW(
-            keras.optimizers.schedules.ExponentialDecay(0.01, 10, 0.9), use_ema=True, ema_overwrite_frequency=7
-        )
-        own = {"q_network": NETWORKS["Normalization, adapted"](), "optimizer": optimizer, "targets": own_targets}
-        return trained(make_env, config=config, loss=keras.losses.Huber(), **own, **more)
-
-    whole = run(12)
-    run(5, checkpoint=tmp_path)
-    np.testing.assert_array_equal(whole, run(12, checkpoint=tmp_path, resume=True))
 
 
 # What a review found
@@ -855,50 +761,6 @@ def test_averages_of_no_update_do_not_become_the_network(cartpole):
     assert np.abs(run.q_network.get_weights()[0]).sum() > 1
 
 
-def test_a_compiled_networks_optimizer_is_part_of_what_must_be_the_same(tmp_path, cartpole):
-    def go_on(optimizer, resume=True):
-        network = NETWORKS["dense"]()
-        network.compile(optimizer, loss="mse")
-        train(cartpole, QUICK, seed=0, q_network=network, checkpoint=tmp_path, resume=resume, verbose=0)
-
-    go_on(keras.optimizers.SGD(0.1), resume=False)
-    go_on(keras.optimizers.SGD(0.1))
-    with pytest.raises(ValueError, match=r"^optimizer is "):
-        go_on(keras.optimizers.SGD(0.5, clipnorm=1e-3))
-
-
-class OwnLoss(keras.losses.Loss):
-    def call(self, y, q):
-        return FACTOR * tf.reduce_mean(tf.square(y - q), axis=-1)
-
-
-class Two:
-    def first(self, y, q):
-        return tf.reduce_mean(tf.square(y - q))
-
-    def second(self, y, q):
-        return 1000 * tf.reduce_mean(tf.square(y - q))
-
-
-def test_losses_are_known_by_all_that_they_compute_with(tmp_path, cartpole, monkeypatch):
-    def go_on(loss, folder, resume=True):
-        train(cartpole, QUICK, seed=0, loss=loss, checkpoint=tmp_path / folder, resume=resume, verbose=0)
-
-    module = __import__(__name__, fromlist="_")
-    go_on(OwnLoss(), "own", resume=False)
-    go_on(OwnLoss(), "own")  # which Keras calls by another name
-    go_on(Two().first, "method", resume=False)
-    go_on(loss_by_helper, "helper", resume=False)
-    with pytest.raises(ValueError, match=r"^loss is "):
-        go_on(Two().second, "method")
-    monkeypatch.setattr(module, "FACTOR", 7.0)
-    with pytest.raises(ValueError, match=r"^loss is "):
-        go_on(OwnLoss(), "own")
-    monkeypatch.setattr(module, "helper", bent)
-    with pytest.raises(ValueError, match=r"^loss is "):
-        go_on(loss_by_helper, "helper")
-
-
 def test_a_compiled_network_with_a_list_of_losses_is_refused(cartpole):
     network = NETWORKS["dense"]()
     network.compile(sgd(), loss=["mse"])
@@ -910,3 +772,94 @@ def test_another_reward_of_the_packages_cartpole_is_seen(monkeypatch):
     before = train(CartPole(), QUICK, seed=0, verbose=0).rewards
     monkeypatch.setattr(CartPole, "reward", lambda *_: tf.constant(7.0))
     np.testing.assert_array_equal(train(CartPole(), QUICK, seed=0, verbose=0).rewards, 7 * before)
+
+
+def test_a_function_of_the_users_can_still_be_differentiated_after_a_run():
+    @tf.custom_gradient
+    def clipped(x):
+        return tf.identity(x), lambda dy: tf.clip_by_value(dy, -1.0, 1.0)
+
+    @tf.function
+    def loss(y, q):
+        return tf.reduce_sum(clipped(y - q) * 5)
+
+    trained(loss=loss)
+    y, q = tf.zeros([8]), tf.zeros([8])
+    with tf.GradientTape() as tape:
+        tape.watch(q)
+        value = loss(y, q)
+    np.testing.assert_array_equal(tape.gradient(value, q), -np.ones(8))
+
+
+@BOTH_LOOPS
+def test_averages_are_the_networks_before_callbacks_hear_of_the_end(make_env, tmp_path):
+    optimizer, seen, best = keras.optimizers.SGD(0.1, use_ema=True, ema_momentum=0.99), [], []
+
+    class Restoring(keras.callbacks.Callback):
+        def on_epoch_end(self, epoch, logs=None):
+            best.append(self.model.get_weights())
+
+        def on_train_end(self, logs=None):
+            seen.append(self.model.get_weights())
+            self.model.set_weights(best[0])
+
+    run = train(make_env(), QUICK, seed=0, optimizer=optimizer, callbacks=Restoring(), verbose=0)
+    averages = optimizer._model_variables_moving_average
+    assert all(map(np.array_equal, seen[0], averages))
+    assert all(map(np.array_equal, run.q_network.get_weights(), best[0]))
+
+
+def test_a_run_with_averages_and_callbacks_is_resumed_bit_for_bit(tmp_path):
+    def run(num_episodes, **more):
+        optimizer = keras.optimizers.SGD(0.1, use_ema=True, ema_momentum=0.9)
+        config = Config(num_episodes=num_episodes, batch_size=8, solved_reward=1e6)
+        return trained(config=config, optimizer=optimizer, callbacks=keras.callbacks.LambdaCallback(), **more)
+
+    whole = run(9)
+    run(5, checkpoint=tmp_path)
+    np.testing.assert_array_equal(whole, run(9, checkpoint=tmp_path, resume=True))
+    np.testing.assert_array_equal(whole, run(9, checkpoint=tmp_path, resume=True))  # which has nothing left to do
+
+
+def test_a_network_is_compiled_with_the_loss_and_optimizer_that_it_learns_with(tmp_path):
+    save = keras.callbacks.ModelCheckpoint(tmp_path / "network.keras")
+    train(CartPole(), QUICK, 0, q_network=NETWORKS["dense"](), loss="huber", callbacks=save, verbose=0)
+    assert keras.saving.load_model(tmp_path / "network.keras").loss == "huber"
+    optimizer = keras.optimizers.AdamW(0.01)
+    run = train(CartPole(), QUICK, 0, optimizer=optimizer, loss="mae", verbose=0)
+    before = int(optimizer.iterations)
+    train(CartPole(), QUICK, 0, q_network=run.q_network, verbose=0)
+    assert int(optimizer.iterations) == 2 * before
+    assert run.q_network.loss == "mae"
+
+
+AXIS_LOSSES = ["mse", "mae", "huber", "kl_divergence", "cosine_similarity", "categorical_hinge", "log_cosh"]
+
+
+@pytest.mark.parametrize("loss", AXIS_LOSSES)
+def test_the_name_of_a_loss_means_what_it_means_to_compile(loss, random_batch):
+    batch = [np.abs(x) for x in random_batch(8)]
+    q_network, q_hat_network = fresh()
+    value = float(learn(batch, 0.0, q_network, q_hat_network, keras.optimizers.SGD(0.0), loss=loss))
+    values = keras.Sequential([keras.Input((1,)), keras.layers.Identity()])
+    values.compile("sgd", loss=loss)
+    q = np.take_along_axis(q_network(batch[0]).numpy(), batch[1][:, None], axis=1)
+    assert value == pytest.approx(values.evaluate(q, batch[2][:, None], batch_size=8, verbose=0), rel=1e-5)
+
+
+class Scaling(keras.layers.Layer):
+    """Keeps a function over its own weight."""
+
+    def build(self, shape):
+        self.scale = self.add_weight(shape=(), initializer="ones")
+        self.function = lambda x: x * self.scale
+
+    def call(self, inputs):
+        return self.function(inputs)
+
+
+def test_a_function_that_a_layer_makes_for_itself_is_the_copys_own(cartpole):
+    run = train(cartpole, QUICK, 0, q_network=sequential(dense(8), Scaling()), verbose=0)
+    layer = run.q_hat_network.layers[1]
+    layer.scale.assign(0.0)
+    assert not layer(np.ones((1, 8), np.float32)).numpy().any()

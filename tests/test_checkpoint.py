@@ -16,9 +16,11 @@ import numpy as np
 import pytest
 
 from dqn_keras import Config, evaluate, load_agent, make_networks, train
+from dqn_keras.agent import make_agent
 from dqn_keras.environments import CartPole
 from dqn_keras.storage.checkpoint import Checkpoints
 from dqn_keras.storage.files import from_bytes, to_bytes
+from dqn_keras.storage.identity import identity
 from dqn_keras.storage.networks import save_agent
 from tests import faults
 from tests.environments import Corridor
@@ -448,4 +450,6 @@ def test_a_network_that_cannot_be_trusted_is_not_loaded(tmp_path):
 def test_nothing_is_restored_from_a_checkpoint_that_is_not_there(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert Checkpoints(tmp_path / "none", CartPole(), CONFIG).restore(None, SEED) is None
+        agent = make_agent((4,), 2, CONFIG, SEED)
+        checkpoints = Checkpoints(tmp_path / "none", identity(CartPole(), CONFIG, agent))
+        assert checkpoints.restore(agent, SEED) is None

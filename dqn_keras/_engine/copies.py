@@ -123,6 +123,8 @@ def _carry_attributes(layer: keras.layers.Layer, copied: keras.layers.Layer) -> 
         is_variable = isinstance(value, keras.Variable | tf.Variable)  # the copy has its own
         is_an_array = tf.is_tensor(value) and hasattr(value, "numpy") and not is_variable
         is_its_own = name.lstrip("_") in ("name", "path", "build", "quantize", "auto_name")
+        code = getattr(value, "__code__", None)  # of a function that the copy has made for itself, over its own weights
+        is_its_own |= code is not None and getattr(vars(copied).get(name), "__code__", None) is code
         if (is_plain or is_an_array) and not is_its_own:
             vars(copied)[name] = value
 

@@ -1,8 +1,37 @@
 """What a traced function computes, apart from the names in it."""
 
 import hashlib
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+from dqn_keras._engine.private import handle, traced
+from dqn_keras._engine.tensorflow import tf
+
+
+class Computation(NamedTuple):
+    """What a function does, as another process can tell it again."""
+
+    digest: str
+    """Equal for functions that compute the same from the same; empty if the function calls Python, which is unseen."""
+    other_variables: list[tf.Variable]
+    """The variables that it reads or changes beside those it is known to."""
+
+
+def computation(
+    function: Callable, specs: Sequence[tf.TensorSpec], variables: Sequence[tf.Variable] = ()
+) -> Computation:
+    """Traces `function` of tensors as in `specs`, which may use `variables`."""
+    concrete = traced(function, specs)
+    numbers: dict[int, Any] = {id(handle(x)): (i, tuple(x.shape)) for i, x in enumerate(variables)}
+    others = [x for x in concrete.variables if id(x.handle) not in numbers]
+    numbers |= {id(x.handle): ("other", i, tuple(x.shape)) for i, x in enumerate(others)}
+    captured = [
+        numbers.get(id(x), x.dtype.name if x.dtype == tf.resource else (x.dtype.name, x.numpy().tobytes()))
+        for x in concrete.captured_inputs
+    ]
+    calls_python = any("PyFunc" in node.op for function in _functions(concrete) for node in function.node_def)
+    digest = hashlib.sha256(repr((fingerprint(concrete), captured)).encode()).hexdigest()[:12]
+    return Computation("" if calls_python else digest, others)
 
 
 def fingerprint(concrete: Any) -> str:
@@ -11,8 +40,9 @@ def fingerprint(concrete: Any) -> str:
     TensorFlow numbers the names of nodes and functions through a process, and Keras those of layers, so that the same
     code traced twice gives graphs that differ in names alone. Two functions of one fingerprint compute the same.
     """
-    library = {function.signature.name: function for function in concrete.graph.as_graph_def().library.function}
-    functions = [concrete.function_def]
+    first, *others = _functions(concrete)
+    library = {function.signature.name: function for function in others}
+    functions = [first]
     numbers: dict[str, int] = {}  # of the inner functions, in the order in which they are met
     digest = hashlib.sha256()
     for function in functions:  # which grows on the way
@@ -20,6 +50,11 @@ def fingerprint(concrete: Any) -> str:
             digest.update(repr(part).encode())
         functions += [library[name] for name in list(numbers)[len(functions) - 1 :]]
     return digest.hexdigest()
+
+
+def _functions(concrete: Any) -> list[Any]:
+    """The function as a FunctionDef, and those that it may call."""
+    return [concrete.function_def, *concrete.graph.as_graph_def().library.function]
 
 
 def _parts(function: Any, numbers: dict[str, int]) -> Iterator[Any]:

@@ -1,8 +1,7 @@
 """Private API of TensorFlow and Keras, all of it, each use with a public way that is taken where it is missing."""
 
-import contextlib
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from dqn_keras._engine.tensorflow import keras, tf
@@ -39,11 +38,12 @@ def handle(variable: Any) -> tf.Tensor:
     return (variable.value if isinstance(variable, keras.Variable) else variable).handle
 
 
-@contextlib.contextmanager
-def custom_gradients_forgotten() -> Iterator[None]:
-    """Forgets the gradients of tf.custom_gradient that are registered within, each of which keeps a whole graph alive.
+def traced(function: Callable, specs: Sequence[tf.TensorSpec], jit_compile: bool | None = None) -> Any:
+    """`function` of tensors as in `specs` as a ConcreteFunction, which leaves nothing behind when it goes.
 
-    They are there to differentiate a function once more, which nobody does with a program.
+    TensorFlow registers the gradient of every tf.custom_gradient for good, and each keeps a whole graph alive. They are
+    there to differentiate a function once more, which nobody does with this one. Those in a tf.function that it calls
+    stay: whoever made that may still need them.
     """
     try:
         from tensorflow.python.framework.ops import gradient_registry
@@ -52,11 +52,28 @@ def custom_gradients_forgotten() -> Iterator[None]:
     except (ImportError, AttributeError):  # then they stay
         registry = {}
     before = set(registry)
-    try:
-        yield
-    finally:
-        for name in set(registry) - before:
+    concrete = tf.function(function, jit_compile=jit_compile, autograph=False).get_concrete_function(*specs)
+    if new := set(registry) - before:
+        for name in new - _gradients_of_functions_called(concrete):
             del registry[name]
+    return concrete
+
+
+def _gradients_of_functions_called(concrete: Any) -> set[str]:
+    """The names of the custom gradients in the functions that a graph calls, those in its own loops left out."""
+    library = {function.signature.name: function for function in concrete.graph.as_graph_def().library.function}
+    called, names = set(), set()
+    to_do = [(concrete.function_def, False), *((function, False) for function in library.values())]
+    while to_do:
+        function, is_called = to_do.pop()
+        for node in function.node_def:
+            if is_called and "_gradient_op_type" in node.attr:
+                names.add(node.attr["_gradient_op_type"].s.decode())
+            if is_called or "PartitionedCall" in node.op:
+                inner = [f.name for x in node.attr.values() for f in (x.func, *x.list.func) if f.name in library]
+                to_do += [(library[name], True) for name in inner if name not in called]
+                called.update(inner)
+    return names
 
 
 def all_layers(network: keras.Model) -> list[keras.layers.Layer]:

@@ -17,10 +17,10 @@ from dqn_keras._engine.made_here import units_if_made_here
 from dqn_keras._engine.private import (
     caller,
     can_swap_variables,
-    custom_gradients_forgotten,
     handle,
     is_built_for,
     is_plain_adam,
+    traced,
 )
 from dqn_keras._engine.tensorflow import keras, require_xla, tf
 from dqn_keras.checks.networks import check_optimizer
@@ -155,8 +155,7 @@ def bind(
 def _trace_the_public_way(
     make_function: Callable, specs: Sequence, learner: Learner, variables: Sequence[tf.Variable], jit_compile: bool
 ) -> Callable[..., list[tf.Tensor]]:
-    function = tf.function(make_function(learner, variables), jit_compile=jit_compile, autograph=False)
-    concrete = function.get_concrete_function(*specs)
+    concrete = _traced(make_function(learner, variables), specs, jit_compile)
     return _saying_what_xla_refused(lambda *tensors: tf.nest.flatten(concrete(*tensors)))
 
 
@@ -180,13 +179,22 @@ def _trace(
     make_function: Callable, specs: Sequence, learner: Learner, variables: Sequence[tf.Variable], jit_compile: bool
 ) -> _Program:
     """The program, traced on these very objects. If an equal one was compiled before, that is used."""
-    function = tf.function(make_function(learner, variables), jit_compile=jit_compile, autograph=False)
-    with custom_gradients_forgotten():
-        concrete = function.get_concrete_function(*specs)
+    concrete = _traced(make_function(learner, variables), specs, jit_compile)
     numbers = {id(handle): i for i, handle in enumerate(_handles(learner, variables))}
     captured = [numbers.get(id(x), x) for x in concrete.captured_inputs]
     concrete = _compiled.setdefault((fingerprint(concrete), jit_compile), concrete)
     return _Program(caller(concrete), captured)
+
+
+def _traced(function: Callable, specs: Sequence, jit_compile: bool) -> Any:
+    try:
+        return traced(function, specs, jit_compile)
+    except ValueError as error:
+        if "No gradients provided" not in str(error):
+            raise
+        raise ValueError(
+            "loss must depend on q by operations that TensorFlow can differentiate: q_network gets no gradient"
+        ) from error
 
 
 def _handles(learner: Learner, variables: Sequence[tf.Variable]) -> list[tf.Tensor]:

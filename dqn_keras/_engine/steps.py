@@ -2,7 +2,8 @@
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable
+from types import MethodType
 from typing import Any, NamedTuple
 
 from dqn_keras._engine.private import all_layers
@@ -33,49 +34,57 @@ _MOST_KEPT = 8
 
 
 def compiled_step(
-    make_step: Callable[..., Callable], learner: Learner, formulas: Formulas, jit_compile: bool
+    make_step: Callable[..., Callable], learner: Learner, formulas: Formulas, key: Hashable, batch_size: int, jit: bool
 ) -> Callable[..., list[tf.Tensor]]:
-    """The step that `make_step(learner)` is, compiled for these very objects and any size of the batch.
+    """The step that `make_step(learner)` is, compiled for these very objects.
 
     It is a function of (states, actions, rewards, next_states, terminal_states, gamma, tau), tensors all, and is found
-    at once from the second call on, until one of the objects changes.
+    at once from the second call on, until one of the objects changes. `key` tells apart formulas of the package's; with
+    it, the step takes a batch of any size, and with formulas of the user's (None) one of `batch_size`, so that the
+    shapes of what they return can be checked.
     """
-    parts = (*learner, *formulas, jit_compile)
+    size = batch_size if key is None else None
+    parts = (*learner, *formulas, size, jit)
     steps: _Steps = vars(learner.q_network).setdefault("_dqn_keras_steps", _Steps())
+    why = "a part or a batch size that is new"
     for step in steps.kept:
-        if all(a is b or (isinstance(a, str) and a == b) for a, b in zip(step.parts, parts, strict=True)):
+        if all(map(_is_the_same, step.parts, parts)):
             if step.watch.is_unchanged():
                 return step.call
+            why = f"{step.watch.what_changed()}, which has changed"
             steps.kept.remove(step)
             break
     formulas.check()
     learner.prepare()
     if not steps.num_compiled:
         warn_of_inference_mode(learner.q_network)
-    call = _bind(make_step, learner, formulas, jit_compile)
+    call = _bind(make_step, learner, key, size, jit)
     watch = Watch(*parts, *all_layers(learner.q_network), *all_layers(learner.q_hat_network))
     steps.kept = [*steps.kept[1 - _MOST_KEPT :], _Step(parts, watch, call)]
     steps.num_compiled += 1
     if steps.num_compiled == _MOST_KEPT:
         warnings.warn(
-            f"learn was compiled {_MOST_KEPT} times for {learner.q_network.name!r}, which takes time and memory: pass "
-            "the same optimizer, targets and loss at each call, instead of new ones",
+            f"learn was compiled {_MOST_KEPT} times for {learner.q_network.name!r}, which takes time and memory, the "
+            f"last time for {why}: pass the same objects at each call, and leave them as they are",
             stacklevel=3,
         )
     return call
 
 
+def _is_the_same(a: Any, b: Any) -> bool:
+    """Python makes a method, and may make a string, anew at each use."""
+    return a is b or (isinstance(a, str | MethodType | int) and a == b)
+
+
 def _bind(
-    make_step: Callable[..., Callable], learner: Learner, formulas: Formulas, jit_compile: bool
+    make_step: Callable[..., Callable], learner: Learner, key: Hashable, size: int | None, jit: bool
 ) -> Callable[..., list[tf.Tensor]]:
-    states = tf.TensorSpec((None, *learner.q_network.input_shape[1:]))  # a batch of any size
-    vector, scalar = tf.TensorSpec((None,)), tf.TensorSpec(())
-    specs: Sequence[tf.TensorSpec] = (states, tf.TensorSpec((None,), tf.int32), vector, states, vector, scalar, scalar)
+    states, vector, scalar = (tf.TensorSpec(x) for x in ((size, *learner.q_network.input_shape[1:]), (size,), ()))
     return bind(
         lambda learner, _: make_step(learner),
-        specs,
+        (states, tf.TensorSpec((size,), tf.int32), vector, states, vector, scalar, scalar),
         learner,
-        key=("learn", formulas.key),
-        has_own_parts=not formulas.are_the_packages,
-        jit_compile=jit_compile,
+        key=("learn", key),
+        has_own_parts=key is None,
+        jit_compile=jit,
     )

@@ -1,6 +1,7 @@
 """The two formulas of a gradient step, targets and loss, and what they must return."""
 
-from collections.abc import Callable, Hashable
+import inspect
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from dqn_keras._engine.tensorflow import keras, tf
@@ -22,6 +23,9 @@ class Formulas(NamedTuple):
             raise TypeError(
                 f"loss must be a name that Keras knows, a keras.losses.Loss or a function of (y, q), got {self.loss!r}"
             )
+        _check_takes("targets", self.targets, ("experiences", "gamma", "q_network", "q_hat_network"))
+        if not isinstance(self.loss, str):
+            _check_takes("loss", self.loss, ("y", "q"))
 
     def loss_function(self) -> Callable:
         """The loss as something to call; ValueError if Keras does not know its name."""
@@ -31,16 +35,6 @@ class Formulas(NamedTuple):
             return keras.losses.get(self.loss)
         except ValueError:
             raise ValueError(f"loss must be a name that Keras knows, such as 'mse', got {self.loss!r}") from None
-
-    @property
-    def are_the_packages(self) -> bool:
-        """Whether both are parts of this package or of Keras, which do not change while a process lives."""
-        return getattr(self.targets, "__module__", None) == "dqn_keras.learn" and isinstance(self.loss, str)
-
-    @property
-    def key(self) -> Hashable:
-        """Equal for equal formulas, as long as they live."""
-        return tuple(self) if self.are_the_packages else tuple(map(id, self))
 
     def y(self, experiences: Any, gamma: Any, q_network: keras.Model, q_hat_network: keras.Model) -> tf.Tensor:
         """The targets [B], to which no gradient flows."""
@@ -55,10 +49,21 @@ class Formulas(NamedTuple):
     def loss_of(self, y: tf.Tensor, q: tf.Tensor) -> tf.Tensor:
         """The loss of targets [B] and values [B], a scalar. One value for each transition counts as their mean."""
         loss = self.loss_function()
-        if isinstance(loss, keras.losses.Loss):  # which takes the last axis for that of a sample
-            y, q = y[:, None], q[:, None]
+        is_the_originals = loss is keras.losses.mean_squared_error  # of two vectors, as the original has it
+        if isinstance(loss, keras.losses.Loss) or (isinstance(self.loss, str) and not is_the_originals):
+            y, q = y[:, None], q[:, None]  # [B, 1], as `fit` has them: Keras takes the last axis for that of a sample
         value = loss(y, q)
         if not tf.is_tensor(value) or not (value.shape.rank == 0 or value.shape.is_compatible_with(y.shape[:1])):
             got = f"shape {value.shape}" if tf.is_tensor(value) else repr(value)
             raise ValueError(f"loss must return a scalar tensor, or one value for each transition, got {got}")
         return tf.cast(tf.reduce_mean(value), tf.float32)
+
+
+def _check_takes(name: str, function: Callable, arguments: tuple[str, ...]) -> None:
+    """TypeError if the function cannot be called with so many arguments."""
+    try:
+        inspect.signature(function, follow_wrapped=False).bind(*arguments)
+    except ValueError:  # it has no signature that Python knows
+        pass
+    except TypeError as error:
+        raise TypeError(f"{name} must be a function of ({', '.join(arguments)}), got {function!r}: {error}") from None

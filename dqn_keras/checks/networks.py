@@ -19,11 +19,13 @@ def check_network(name: str, network: keras.Model) -> None:
     for kind, tensors in ("input", network.inputs), ("output", network.outputs):
         if len(tensors) != 1:
             raise ValueError(f"{name} must have one {kind}, got {len(tensors)}")
-    shape, dtype = network.output_shape, network.outputs[0].dtype
-    if not isinstance(shape, tuple) or len(shape) != 2 or shape[1] is None:
-        raise ValueError(f"{name} must give Q-values of shape [B, A], got output {shape}")
-    if dtype != "float32":
-        raise ValueError(f"{name} must give float32 values, got {dtype}")
+    output = network.outputs[0] if isinstance(network, keras.Sequential) else network.output
+    is_tensor = isinstance(output, keras.KerasTensor)  # neither a list nor a dictionary of one
+    if not is_tensor or len(output.shape) != 2 or output.shape[1] is None:
+        got = output.shape if is_tensor else f"a {type(output).__name__}"
+        raise ValueError(f"{name} must give Q-values of shape [B, A], got output {got}")
+    if output.dtype != "float32":
+        raise ValueError(f"{name} must give float32 values, got {output.dtype}")
 
 
 def check_fits(q_network: keras.Model, state_shape: tuple[int, ...], num_actions: int) -> None:

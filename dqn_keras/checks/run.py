@@ -49,13 +49,13 @@ def check_own_parts(
     if optimizer is not None:
         check_optimizer(optimizer)
     owners = owners_optimizer(q_network)
+    if loss is None and q_network is not None and q_network.compiled:
+        loss = getattr(q_network, "loss", None)
+        if isinstance(loss, list | tuple | dict):
+            raise ValueError(f"q_network must be compiled with one loss, got {loss!r}; or give train a loss")
     if owners is not None:
-        if loss is None:
-            loss = getattr(q_network, "loss", None)
-            if isinstance(loss, list | tuple | dict):
-                raise ValueError(f"q_network must be compiled with one loss, got {loss!r}; or give train a loss")
         config_of_compile = arguments_of_compile(q_network)
-        ignored = [x for x in ("metrics", "weighted_metrics", "loss_weights") if config_of_compile.get(x)]
+        ignored = [x for x in _IGNORED if config_of_compile.get(x)]
         if ignored:
             warnings.warn(f"{', '.join(ignored)} of q_network.compile are not used by train", stacklevel=3)
     formulas = Formulas(targets, "mse" if loss is None else loss)
@@ -65,6 +65,9 @@ def check_own_parts(
     if q_network is not None:
         warn_of_inference_mode(q_network)
     return formulas
+
+
+_IGNORED = ("metrics", "weighted_metrics", "loss_weights", "run_eagerly")
 
 
 def check_learning_rate(optimizer: keras.Optimizer, config: Config) -> None:

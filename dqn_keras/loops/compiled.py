@@ -9,7 +9,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Generator, Hashable, Sequence
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ from dqn_keras.checks.environments import Spaces
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
 from dqn_keras.environments import TWINS
-from dqn_keras.learn import DEFAULT_FORMULAS, Metrics
+from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, packages
 from dqn_keras.loops.draws import draw_bits, episode_key, sample_indices, to_integer, to_uniform
 from dqn_keras.metrics import Episode, checked_step, is_all_finite
 from dqn_keras.policy import decay_epsilon
@@ -134,22 +134,24 @@ def _bind_program(
     numbers = _numbers(env, agent, config, [0.0] * _CAPACITY, 0)
     specs = [tf.TensorSpec(x.shape, x.dtype) for x in numbers]
     is_a_twin = type(env) in TWINS.values() and vars(env) == vars(type(env)())
-    environment = (type(env), _constants(type(env))) if is_a_twin else id(env)
+    environment = (type(env), _constants(type(env))) if is_a_twin else None
+    known = packages(formulas)
     return bind(
         make_program,
         specs,
         agent.learner,
         variables,
-        key=("episodes", environment, config.steps_per_update, config.batch_size, config.memory_size, formulas.key),
-        has_own_parts=not (is_a_twin and formulas.are_the_packages),
+        key=("episodes", environment, config.steps_per_update, config.batch_size, config.memory_size, known),
+        has_own_parts=not is_a_twin or known is None,
         jit_compile=True,
     )
 
 
 def _constants(cls: type) -> Hashable:
-    """Numbers and methods of an environment of this package, which may be changed to try out another physics."""
+    """What an environment of this package reads, which may be changed to try out another physics."""
     named = vars(sys.modules[cls.__module__]) | vars(cls)
-    return tuple((name, x) for name, x in named.items() if isinstance(x, int | float | FunctionType))
+    values = {name: x for name, x in named.items() if name[:2] != "__" and not isinstance(x, ModuleType | type)}
+    return tuple((name, x if isinstance(x, FunctionType) else (type(x), repr(x))) for name, x in values.items())
 
 
 _FAULTS = ("nothing", "an observation", "a reward", "the loss or a weight")

@@ -18,7 +18,7 @@ from dqn_keras.agent import Agent, DivergedError
 from dqn_keras.checks.environments import CheckedEnv
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
-from dqn_keras.learn import DEFAULT_FORMULAS, Metrics
+from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, packages
 from dqn_keras.metrics import Episode, checked_step, sum_up
 from dqn_keras.policy import action, decay_epsilon
 from dqn_keras.replay import Experience, unpack
@@ -139,8 +139,8 @@ def _bind_step(
         make_step,
         specs,
         agent.learner,
-        key=("update", formulas.key, gives_weights),
-        has_own_parts=not formulas.are_the_packages,
+        key=("update", packages(formulas), gives_weights),
+        has_own_parts=packages(formulas) is None,
         jit_compile=config.jit_compile,
     )
     numbers = tf.constant([config.gamma, config.tau], tf.float32)

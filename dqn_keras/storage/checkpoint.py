@@ -7,22 +7,19 @@ written under another name, flushed to the disk, and only then given its own, so
 import contextlib
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from gymnasium.experimental.functional import FuncEnv
 
-from dqn_keras._engine.tensorflow import keras
+from dqn_keras._engine.tensorflow import keras, tf
 from dqn_keras.agent import Agent
-from dqn_keras.checks.formulas import Formulas
-from dqn_keras.config import Config
-from dqn_keras.learn import DEFAULT_FORMULAS, Metrics
+from dqn_keras.learn import Metrics
 from dqn_keras.metrics import Episode
 from dqn_keras.replay import unpack
 from dqn_keras.storage.files import FORMAT, DamagedError, from_bytes, replacing, to_bytes
-from dqn_keras.storage.identity import check_is_same, identity, warn_of_other_versions
+from dqn_keras.storage.identity import Identity, check_is_same, warn_of_other_versions
 
 
 class Checkpoints:
@@ -31,16 +28,12 @@ class Checkpoints:
     def __init__(
         self,
         folder: str | os.PathLike,
-        env: gym.Env | FuncEnv,
-        config: Config,
-        q_network: keras.Model | None = None,
-        optimizer: keras.Optimizer | None = None,
-        formulas: Formulas = DEFAULT_FORMULAS,
+        identity: Identity,
         every: int = 100,
     ) -> None:
         self.folder = Path(folder)
         self._every, self._saved_at = every, 0
-        self._identity = identity(env, config, q_network, optimizer, formulas)
+        self._identity, self._other_variables = identity
         self._kept: list[Path] = []  # the newest first, all known to be whole
 
     def paths(self) -> list[Path]:
@@ -83,7 +76,7 @@ class Checkpoints:
     def save(self, agent: Agent) -> None:
         """Save the state of `agent`, which must be at an episode's end; OSError if the disk does not take it."""
         path = self.folder / f"checkpoint-{len(agent.episodes):010d}.npz"
-        content = to_bytes(_arrays(agent), {"format": FORMAT, **self._identity, **_facts(agent)})
+        content = to_bytes(_arrays(agent, self._other_variables), {"format": FORMAT, **self._identity, **_facts(agent)})
         self.folder.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary:
             temporary.write_bytes(content)
@@ -106,7 +99,7 @@ class Checkpoints:
                 check_facts(facts, self._identity | _facts(agent))
                 changeable = ["num_episodes"] if seed is not None else ["num_episodes", "seed"]
                 check_is_same(path, facts, {**self._identity, "seed": seed}, but_for=changeable)
-                _restore(agent, arrays, facts)
+                _restore(agent, self._other_variables, arrays, facts)
             except (DamagedError, OSError) as error:
                 damaged.append(f"{path} cannot be used: {error}")
                 continue
@@ -125,23 +118,20 @@ class Checkpoints:
         return None
 
 
-def _arrays(agent: Agent) -> dict[str, Any]:
+def _arrays(agent: Agent, others: Sequence[tf.Variable]) -> dict[str, Any]:
     """All that is an array, by name."""
     columns = {f"episodes/{x}": np.array([getattr(e, x) for e in agent.episodes], t) for x, t in _COLUMNS.items()}
-    variables = {name: v.numpy() for name, v in _variables(agent).items()}
+    variables = {name: v.numpy() for name, v in _variables(agent, others).items()}
     return {**columns, "memory": agent.memory.rows[: len(agent.memory)], **variables}
 
 
 _COLUMNS: dict[str, Any] = dict.fromkeys(Episode._fields[1:], np.float64) | {"steps": np.int64, "terminated": np.bool_}
 
 
-def _variables(agent: Agent) -> dict[str, keras.Variable]:
+def _variables(agent: Agent, others: Sequence[tf.Variable]) -> dict[str, keras.Variable | tf.Variable]:
     """By names that do not depend on those of the layers, which Keras numbers through a process."""
-    return {
-        f"{owner}/{i}": variable
-        for owner, part in agent.learner._asdict().items()
-        for i, variable in enumerate(part.variables)
-    }
+    owners = {name: part.variables for name, part in agent.learner._asdict().items()} | {"other": others}
+    return {f"{owner}/{i}": variable for owner, variables in owners.items() for i, variable in enumerate(variables)}
 
 
 def _facts(agent: Agent) -> dict[str, Any]:
@@ -163,7 +153,7 @@ def check_facts(facts: dict[str, Any], expected: dict[str, Any]) -> None:
             raise DamagedError(f"{name} is missing or wrong in it: {facts.get(name)!r}")
 
 
-def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
+def _restore(agent: Agent, others: Sequence[tf.Variable], arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
     """Put a fresh agent into a saved state; nothing is changed if the state does not fit it."""
     num_episodes, num_appended, epsilon = facts["num_episodes"], facts["num_appended"], facts["epsilon"]
     rng = np.random.default_rng(0)
@@ -171,12 +161,12 @@ def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any])
         rng.bit_generator.state = facts["rng"]
     except (KeyError, TypeError, ValueError) as error:
         raise DamagedError(f"rng is wrong in it: {error!r}") from None
-    expected = _arrays(agent)
+    expected = _arrays(agent, others)
     expected |= {f"episodes/{name}": np.zeros(max(0, num_episodes), dtype) for name, dtype in _COLUMNS.items()}
     expected["memory"] = agent.memory.rows[:num_appended]
     # A run goes on while an average of Adam's overflows, as long as the weights are finite.
     may_be_infinite = {f"episodes/{name}" for name in Metrics._fields} | {
-        name for name in expected if name.startswith("optimizer/")
+        name for name in expected if name.startswith(("optimizer/", "other/"))
     }
     if names := sorted(expected.keys() ^ arrays.keys()):
         raise DamagedError(f"its arrays are not an agent's: {', '.join(names)} missing or too many")
@@ -197,5 +187,5 @@ def _restore(agent: Agent, arrays: dict[str, np.ndarray], facts: dict[str, Any])
     agent.memory.rows[: len(arrays["memory"])] = arrays["memory"]
     agent.memory.num_appended, agent.num_updates = num_appended, facts["num_updates"]
     agent.seed, agent.epsilon, agent.rng = facts["seed"], epsilon, rng
-    for name, variable in _variables(agent).items():
+    for name, variable in _variables(agent, others).items():
         variable.assign(arrays[name])

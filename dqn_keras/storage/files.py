@@ -14,7 +14,7 @@ import numpy as np
 
 from dqn_keras.version import __version__
 
-FORMAT = 3
+FORMAT = 4
 
 
 class DamagedError(ValueError):

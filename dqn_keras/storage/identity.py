@@ -10,62 +10,152 @@ import platform
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FunctionType, MethodType
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 
-from dqn_keras._engine.copies import _quiet_about_lambdas
+from dqn_keras._engine.graphs import Computation, computation
+from dqn_keras._engine.libraries import is_of_a_library
 from dqn_keras._engine.private import all_layers
 from dqn_keras._engine.tensorflow import keras, tf
-from dqn_keras._engine.watching import is_of_a_library, read_by
+from dqn_keras.agent import Agent
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
-from dqn_keras.learn import DEFAULT_FORMULAS
+from dqn_keras.learn import DEFAULT_FORMULAS, packages
+from dqn_keras.replay import Experience
 from dqn_keras.version import __version__
+
+
+class Part(NamedTuple):
+    """One part of a run: the network, the optimizer, a formula or the environment."""
+
+    words: Any
+    """What it is called, with its settings as far as they have names."""
+    source: str = ""
+    """A digest of the source of the user's code in it."""
+    computes: str = ""
+    """A digest of the graph that it is traced to, where it has one: it tells apart all that computes something else."""
+
+
+class Identity(NamedTuple):
+    """What must be the same for a saved run to be resumed."""
+
+    facts: dict[str, Any]
+    """As a file holds it."""
+    other_variables: list[tf.Variable]
+    """What the user's parts read or change beside the agent's variables, and so belongs to the state of a run."""
+
+
+def identity_of_study(env: gym.Env | FuncEnv, config: Config) -> dict[str, Any]:
+    """What must be the same for a saved study to be continued; versions may differ."""
+    return _facts(config, env=describe(env)[0])
 
 
 def identity(
     env: gym.Env | FuncEnv,
     config: Config,
+    agent: Agent,
+    formulas: Formulas = DEFAULT_FORMULAS,
     q_network: keras.Model | None = None,
     optimizer: keras.Optimizer | None = None,
-    formulas: Formulas = DEFAULT_FORMULAS,
-) -> dict[str, Any]:
-    """What must be the same for a saved run to be resumed, as a file holds it (versions may differ).
+) -> Identity:
+    """What must be the same for a saved run to be resumed; versions may differ.
+
+    Args:
+        env: the environment.
+        config: the parameters.
+        agent: a new one.
+        formulas: its targets and loss.
+        q_network: the user's; None for the default.
+        optimizer: the user's; None for the default.
 
     Raises:
         ValueError: a function or class of the user's has no name that can be imported.
     """
-    facts = {
-        "config": dataclasses.asdict(config),
-        "environment": describe(env),
-        "q_network": "the default" if q_network is None else _describe_network(q_network),
-        "optimizer": "the default" if optimizer is None else _in_words("optimizer", optimizer),
-        "targets": _in_words("targets", formulas.targets),
-        "loss": _in_words("loss", formulas.loss),
-        "versions": versions(),
+    given = {"q_network": q_network, "optimizer": optimizer}
+    if not packages(formulas):
+        given |= formulas._asdict()
+    for name, part in given.items():
+        _check_can_be_imported(name, part)
+    environment, *computations = describe(env)
+    parts = {"env": environment}
+    for name, (function, specs) in _traceable(agent, config, formulas).items():
+        part = given.get(name, formulas._asdict().get(name))
+        if (part is not None and name in given) or (name == "optimizer" and q_network is not None):
+            computations.append(computation(function, specs, agent.learner.variables))
+            parts[name] = Part(_words(part), _source(part), computations[-1].digest)
+        else:
+            parts[name] = Part(_words(part))
+    others = {id(variable): variable for x in computations for variable in x.other_variables}
+    return Identity(_facts(config, **parts), list(others.values()))
+
+
+def _facts(config: Config, **parts: Part) -> dict[str, Any]:
+    facts = {"config": dataclasses.asdict(config), "parts": {k: x._asdict() for k, x in parts.items()}}
+    return json.loads(json.dumps({**facts, "versions": versions()}))  # tuples become lists
+
+
+def _traceable(agent: Agent, config: Config, formulas: Formulas) -> dict[str, tuple[Callable, list[tf.TensorSpec]]]:
+    """By name, a function that computes what the part does, its gradients included, and what it takes."""
+    q_network, q_hat_network, optimizer = agent.learner
+    weights = q_network.trainable_variables
+    scalar, vector = tf.TensorSpec(()), tf.TensorSpec((config.batch_size,))
+    states = tf.TensorSpec((config.batch_size, *agent.memory.state_shape), agent.memory.rows.dtype)
+    actions = tf.TensorSpec((config.batch_size,), tf.int32)
+
+    def play(states: tf.Tensor) -> list[Any]:
+        with tf.GradientTape() as tape:
+            q_values = q_network(states)
+            total = tf.reduce_sum(q_values) + sum(tf.cast(x, tf.float32) for x in q_network.losses)
+        gradients = tape.gradient(total, weights)
+        return [q_values, total, *(x for x in gradients if x is not None)]
+
+    def update(loss: tf.Tensor, *gradients: tf.Tensor) -> tf.Tensor:
+        optimizer.apply_gradients(zip(gradients, weights, strict=True))
+        return optimizer.scale_loss(loss)
+
+    def targets(*tensors: tf.Tensor) -> tf.Tensor:
+        *batch, gamma = tensors
+        return formulas.y(Experience(*batch), gamma, q_network, q_hat_network)
+
+    def loss(y: tf.Tensor, q: tf.Tensor) -> list[Any]:
+        with tf.GradientTape() as tape:
+            tape.watch(q)
+            value = formulas.loss_of(y, q)
+        gradient = tape.gradient(value, q)
+        return [value] if gradient is None else [value, gradient]
+
+    return {
+        "q_network": (play, [states]),
+        "optimizer": (update, [scalar, *(tf.TensorSpec(w.shape) for w in weights)]),
+        "targets": (targets, [states, actions, vector, states, vector, scalar]),
+        "loss": (loss, [vector, vector]),
     }
-    return json.loads(json.dumps(facts))  # tuples become lists
 
 
 def check_is_same(path: Path, theirs: dict[str, Any], ours: dict[str, Any], but_for: Sequence[str] = ()) -> None:
     """ValueError that begins with the argument of `train`, or field of Config, in which `path` is of another run."""
-    theirs, ours = (
-        {
-            **x["config"],
-            "env": x["environment"],
-            **{name: x.get(name) for name in ("q_network", "optimizer", "targets", "loss", "seed")},
-        }
-        for x in (theirs, ours)
-    )
-    for name in [name for name in ours if name not in but_for]:
-        if name not in theirs or theirs[name] != ours[name]:
-            raise ValueError(f"{name} is {theirs.get(name)!r} in {path}, got {ours[name]!r}")
+    numbers, our_numbers = ({**x["config"], "seed": x.get("seed")} for x in (theirs, ours))
+    for name in [name for name in our_numbers if name not in but_for]:
+        if name not in numbers or numbers[name] != our_numbers[name]:
+            raise ValueError(f"{name} is {numbers.get(name)!r} in {path}, got {our_numbers[name]!r}")
+    can_compare = all(theirs["versions"].get(x) == ours["versions"][x] for x in ("dqn_keras", "tensorflow", "keras"))
+    for name, our_part in ours["parts"].items():
+        saved, here = (Part(**x) for x in (theirs["parts"].get(name, {"words": None}), our_part))
+        if saved.words != here.words:
+            raise ValueError(f"{name} is {saved.words!r} in {path}, got {here.words!r}")
+        if can_compare and saved.computes and here.computes:
+            if saved.computes != here.computes:
+                raise ValueError(
+                    f"{name} is {saved.words!r} in {path}, got one of that name that computes another thing"
+                )
+        elif saved.source != here.source:
+            raise ValueError(f"{name} is {saved.words!r} in {path}, got one of that name with another source")
 
 
 def warn_of_other_versions(path: Path, theirs: dict[str, Any], ours: dict[str, Any], stacklevel: int) -> None:
@@ -79,141 +169,110 @@ def warn_of_other_versions(path: Path, theirs: dict[str, Any], ours: dict[str, A
         )
 
 
-def _describe_network(network: keras.Model) -> str:
-    """The kinds of its layers, and a digest of all that is known of them."""
-    layers = ", ".join(type(layer).__name__ for layer in network.layers)
-    own = [_describe_layer(layer) for layer in all_layers(network)]
-    digest = hashlib.sha256(json.dumps([structure(network), own]).encode())
-    return f"{layers} ({digest.hexdigest()[:12]})"
-
-
-def _describe_layer(layer: keras.layers.Layer) -> Any:
-    """What the layer's configuration does not hold: arrays, as Normalization keeps them, and what is the user's."""
-    arrays = {
-        name: _plain(x)
-        for name, x in vars(layer).items()
-        if isinstance(x, np.ndarray) or (tf.is_tensor(x) and not isinstance(x, keras.Variable | tf.Variable))
-    }
-    functions = {
-        name: _describe_part("q_network", value)
-        for name, value in vars(layer).items()
-        if isinstance(value, FunctionType)
-        and name not in ("build", "quantize")
-        and not is_of_a_library(value.__module__)
-    }
-    if is_of_a_library(type(layer).__module__):
-        return [arrays, functions]
-    numbers = {name: x for name, x in vars(layer).items() if name[0] != "_" and isinstance(x, int | float | str)}
-    return [arrays, functions, {**numbers, "built": True, "name": ""}, _describe_code("q_network", type(layer))]
-
-
-def _in_words(argument: str, part: Any) -> str:
-    description = _describe_part(argument, part)
-    return description if isinstance(description, str) else json.dumps(description)
-
-
-def _describe_part(argument: str, part: Any) -> Any:
-    """A function, a class of Keras' or the user's with its settings, or anything else that JSON can hold."""
+def _words(part: Any) -> str:
+    """What a network, an optimizer or a formula is called, with the settings that were chosen."""
+    if part is None:
+        return "the default"
+    if isinstance(part, str):
+        return part
+    if isinstance(part, keras.Model):
+        layers = ", ".join(type(layer).__name__ for layer in part.layers)
+        return f"{layers} ({part.count_params()} weights)"
     if isinstance(part, functools.partial):
-        return [_describe_part(argument, x) for x in (part.func, list(part.args), part.keywords)]
-    if isinstance(part, MethodType):
-        return [_describe_code(argument, part.__func__), _describe_part(argument, part.__self__)]
-    if hasattr(part, "python_function"):  # a tf.function
-        return _describe_part(argument, part.python_function)
+        return f"partial of {_words(part.func)}"
+    if hasattr(part, "__qualname__"):
+        return f"{part.__module__}.{part.__qualname__}"
+    settings = _chosen_settings(part)
+    if isinstance(rate := getattr(part, "learning_rate", None), keras.Variable):
+        settings["learning_rate"] = f"{float(rate):.6g}"
+    return f"{type(part).__module__}.{type(part).__qualname__}({', '.join(f'{k}={x}' for k, x in settings.items())})"
+
+
+def _chosen_settings(part: Any) -> dict[str, Any]:
+    """Those of a Keras object's configuration that are not as by default, as far as it has one."""
+    try:
+        config, usual = part.get_config(), type(part)().get_config()
+    except Exception:  # whatever a class of the user's says
+        return {}
+    chosen = {name: x for name, x in config.items() if name != "name" and x != usual.get(name)}
+    return {name: x["class_name"] if isinstance(x, dict) and "class_name" in x else x for name, x in chosen.items()}
+
+
+def _source(part: Any) -> str:
+    """A digest of the source of the user's functions and classes that a part is made of."""
+    sources = []
+    for code in _own_code(part, set()):
+        try:
+            sources.append(inspect.getsource(code))
+        except (OSError, TypeError):  # typed in where no source is kept
+            sources.append(code.__qualname__)
+    return hashlib.sha256("".join(sources).encode()).hexdigest()[:12] if sources else ""
+
+
+def _check_can_be_imported(argument: str, part: Any) -> None:
+    """ValueError if a function or class of the user's has no name that says what it is."""
+    for code in _own_code(part, set()):
+        try:
+            is_importable = operator.attrgetter(code.__qualname__)(sys.modules[code.__module__]) is code
+        except (AttributeError, KeyError):
+            is_importable = False
+        if not is_importable:
+            raise ValueError(
+                f"{argument} must have a name that can be imported, since the checkpoint keeps it; "
+                f"{code.__module__}.{code.__qualname__} has none: "
+                "define it with `def` or `class` at the top level of a module, a script or a notebook"
+            )
+
+
+def _own_code(part: Any, met: set[int]) -> Iterator[Any]:
+    """The user's functions and classes that a part is made of: itself, its class, and what its attributes hold."""
+    if id(part) in met:
+        return
+    met.add(id(part))
+    held: list[Any] = []
     if isinstance(part, FunctionType | type):
-        return _describe_code(argument, part)
-    if isinstance(part, keras.Variable):
-        return _plain(part.numpy())
-    if isinstance(part, list | tuple):
-        return [_describe_part(argument, x) for x in part]
-    if isinstance(part, dict):
-        return {str(name): _describe_part(argument, x) for name, x in part.items()}
-    if not hasattr(part, "__dict__"):
-        return _plain(part)
-    settings = {
-        name: _describe_part(argument, x)
-        for name, x in sorted(vars(part).items())
-        if name not in ("name", "built", "_lock") and _is_a_setting(name, x)
-    }
-    return {"class": _describe_code(argument, type(part)), **settings}
+        if not is_of_a_library(part):
+            yield part
+    elif isinstance(part, functools.partial):
+        held = [part.func, *part.args, *part.keywords.values()]
+    elif isinstance(part, MethodType):
+        held = [part.__func__, part.__self__]
+    elif isinstance(part, keras.Model):
+        held = all_layers(part)
+    elif isinstance(part, list | tuple):
+        held = list(part)
+    elif isinstance(part, dict):
+        held = list(part.values())
+    elif hasattr(part, "python_function"):  # a tf.function
+        held = [part.python_function]
+    elif hasattr(part, "__dict__") and not isinstance(part, keras.Variable):
+        of_keras = is_of_a_library(type(part))  # whose other attributes are its books
+        held = [type(part), *(x for x in vars(part).values() if not of_keras or isinstance(x, _MAY_BE_OWN))]
+    for x in held:
+        yield from _own_code(x, met)
 
 
-def _is_a_setting(name: str, value: Any) -> bool:
-    """Of an object's attributes: numbers and the like, and what is the user's; not the books that Keras keeps."""
-    if isinstance(value, FunctionType | type):
-        return not is_of_a_library(value.__module__)
-    is_users = not is_of_a_library(type(value).__module__)
-    return name in ("_learning_rate", "inner_optimizer") or is_users or _is_data(value)
+_MAY_BE_OWN = (
+    FunctionType,
+    functools.partial,
+    MethodType,
+    keras.Optimizer,
+    keras.optimizers.schedules.LearningRateSchedule,
+    keras.losses.Loss,
+    keras.regularizers.Regularizer,
+    keras.constraints.Constraint,
+)
 
 
-def _is_data(value: Any) -> bool:
-    if isinstance(value, dict):
-        return all(map(_is_data, value.values()))
-    if isinstance(value, list | tuple):
-        return all(map(_is_data, value))
-    return value is None or isinstance(value, bool | int | float | str | np.ndarray | np.generic)
-
-
-def _describe_code(argument: str, code: Any) -> Any:
-    """The name of a function or class; if it is the user's, its source and what it reads, too.
-
-    Raises:
-        ValueError: it has no name by which it could be imported.
-    """
-    module, name = code.__module__ or "", code.__qualname__
-    full_name = f"{module}.{name}"
-    if is_of_a_library(module):
-        return full_name
-    try:
-        is_importable = operator.attrgetter(name)(sys.modules[module]) is code
-    except (AttributeError, KeyError):
-        is_importable = False
-    if not is_importable:
-        raise ValueError(
-            f"{argument} must have a name that can be imported, since the checkpoint keeps it; {full_name} has none: "
-            "define it with `def` or `class` at the top level of a module, a script or a notebook"
-        )
-    digest, read = _read_in(code, {})
-    return [full_name, digest, read]
-
-
-def _read_in(code: Any, met: dict[Any, str]) -> tuple[str, dict[str, Any]]:
-    """A digest of the source of a user's function or class and all such that it uses; the numbers they read."""
-    met[code] = ""
-    try:
-        source = inspect.getsource(code)
-    except (OSError, TypeError):  # typed in where no source is kept
-        source = repr(_bytecode(code))
-    is_class = isinstance(code, type)
-    functions = [x for x in vars(code).values() if isinstance(x, FunctionType)] if is_class else [code]
-    used: list[Any] = list(code.__bases__) if is_class else []
-    numbers = {k: _plain(x) for k, x in vars(code).items() if k[:2] != "__" and _is_data(x)} if is_class else {}
-    for function in functions:
-        values = {**read_by(function), "defaults": function.__defaults__}
-        numbers |= {name: _plain(x) for name, x in values.items() if x is not None and _is_data(x)}
-        used += [x for x in values.values() if isinstance(x, FunctionType | type)]
-    for other in used:
-        if other not in met and not is_of_a_library(other.__module__):
-            more, read = _read_in(other, met)
-            source, numbers = source + more, {**read, **numbers}
-    return hashlib.sha256(source.encode()).hexdigest()[:12], numbers
-
-
-def _bytecode(code: Any) -> Any:
-    if isinstance(code, FunctionType):
-        constants = [repr(x) for x in code.__code__.co_consts if not hasattr(x, "co_code")]
-        return code.__code__.co_code, code.__code__.co_names, constants
-    return {name: _bytecode(x) for name, x in sorted(vars(code).items()) if isinstance(x, FunctionType)}
-
-
-def describe(env: gym.Env | FuncEnv) -> dict[str, Any]:
+def describe(env: gym.Env | FuncEnv) -> tuple[Part, *tuple[Computation, ...]]:
     """What makes it this environment, as far as can be seen; `render_mode` does not.
 
-    Of a registered one its id and arguments, of any other the constructor's arguments that it keeps under their names.
+    Of a registered one its id and arguments, of any other the constructor's arguments that it keeps under their names;
+    of a functional one also what it computes.
     """
     wrappers: list[Any] = []
     if isinstance(env, FuncEnv):
-        name, arguments = f"{type(env).__name__} (functional)", {**_class_attributes(env), **vars(env)}
+        name, arguments = f"{type(env).__name__} (functional)", vars(env)
     else:
         wrapper = env
         while isinstance(wrapper, gym.Wrapper):
@@ -226,19 +285,24 @@ def describe(env: gym.Env | FuncEnv) -> dict[str, Any]:
             parameters = inspect.signature(type(env.unwrapped).__init__).parameters
             kept = vars(env.unwrapped)
             name, arguments = type(env.unwrapped).__name__, {k: kept[k] for k in parameters if k in kept}
-    return {
+    words = {
         "name": name,
         "arguments": _plain({key: value for key, value in sorted(arguments.items()) if key != "render_mode"}),
         "wrappers": wrappers,
         "observation_space": str(env.observation_space),
         "action_space": str(env.action_space),
     }
+    if not isinstance(env, FuncEnv):
+        return (Part(words),)
 
+    def play(rng: tf.Tensor, action: tf.Tensor) -> list[Any]:
+        state = env.initial(rng)
+        next_state = env.transition(state, action, rng)
+        reward, terminal = env.reward(state, action, next_state, rng), env.terminal(next_state, rng)
+        return [state, env.observation(state, rng), next_state, reward, terminal]
 
-def _class_attributes(env: FuncEnv) -> dict[str, Any]:
-    """Numbers and the like that the classes of a user's environment hold."""
-    classes = [cls for cls in reversed(type(env).__mro__) if not is_of_a_library(cls.__module__)]
-    return {name: x for cls in classes for name, x in vars(cls).items() if name[:2] != "__" and _is_data(x)}
+    computes = computation(play, [tf.TensorSpec((2,), tf.int64), tf.TensorSpec((), tf.int32)])
+    return Part(words, _source(type(env)), computes.digest), computes
 
 
 def _plain(value: Any, depth: int = 3) -> Any:
@@ -258,7 +322,7 @@ def _plain(value: Any, depth: int = 3) -> Any:
     if tf.is_tensor(value) or isinstance(value, np.ndarray):
         array = np.asarray(value)
         return [str(array.dtype), list(array.shape), hashlib.sha256(array.tobytes()).hexdigest()]
-    if not hasattr(value, "__qualname__") and not is_of_a_library(type(value).__module__) and depth:
+    if not hasattr(value, "__qualname__") and not is_of_a_library(type(value)) and depth:
         return [type(value).__qualname__, _plain(getattr(value, "__dict__", {}), depth - 1)]
     return getattr(value, "__qualname__", type(value).__qualname__)
 
@@ -278,32 +342,3 @@ def _processor() -> str:
         flags = None
     vector = sorted(x for x in flags[1].split() if x.startswith(("sse4", "avx", "fma", "amx"))) if flags else []
     return " ".join([platform.machine(), *vector])
-
-
-def structure(network: keras.Model) -> str:
-    """Equal for networks of one configuration, but for names and for initializers, which have done their work."""
-    with _quiet_about_lambdas():
-        return json.dumps(_without_names(network.get_config(), {}), sort_keys=True, default=repr)
-
-
-def _without_names(config: Any, numbers: dict[str, int]) -> Any:
-    """`numbers` are those of the layers, which refer to each other by name in a functional model."""
-    if isinstance(config, list | tuple):
-        return [_without_names(x, numbers) for x in config]
-    if not isinstance(config, dict):
-        return config
-    if isinstance(layers := config.get("layers"), list):
-        numbers = {layer.get("name", layer["config"].get("name")): i for i, layer in enumerate(layers)}
-    kept = {key: x for key, x in config.items() if key != "name" and not key.endswith("_initializer")}
-    for key, value in kept.items():
-        if key in ("keras_history", "input_layers", "output_layers"):
-            kept[key] = _numbered(value, numbers)
-        elif key != "dtype":
-            kept[key] = _without_names(value, numbers)
-    return kept
-
-
-def _numbered(reference: Any, numbers: dict[str, int]) -> Any:
-    if isinstance(reference, list | tuple):
-        return [_numbered(x, numbers) for x in reference]
-    return numbers.get(reference, reference) if isinstance(reference, str) else reference
