@@ -7,12 +7,14 @@ import hashlib
 import os
 import pickle
 import signal
+import sys
 import threading
 import time
 import uuid
 import warnings
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import cloudpickle
@@ -21,6 +23,7 @@ import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 from joblib import Parallel, cpu_count, delayed, parallel_config
 
+from dqn_keras._engine.libraries import is_of_a_library
 from dqn_keras._engine.programs import shared_in
 from dqn_keras._engine.tensorflow import tf
 from dqn_keras.agent import recycle
@@ -29,7 +32,7 @@ from dqn_keras.checks.run import check_arguments
 from dqn_keras.config import Config
 from dqn_keras.progress import tqdm
 from dqn_keras.storage.files import FORMAT, from_bytes, replacing, to_bytes
-from dqn_keras.storage.identity import check_is_same, identity_of_study, warn_of_other_versions
+from dqn_keras.storage.identity import check_is_same, describe, identity_of_study, warn_of_other_versions
 from dqn_keras.training import train
 
 
@@ -111,8 +114,8 @@ def study(
         engine: "joblib", processes on this machine; or "ray", tasks on the Ray cluster that this process is connected
             to, or else on this machine (needs the extra `ray`); a task whose worker dies is tried again.
         num_workers: processes of joblib; by default as many as there are cores. With 1 all is done in this process.
-            (Ray has as many as its cluster has cores.) Other processes import modules themselves: they see what a
-            notebook or script defines, but not what it has changed in a module that it imports.
+            (Ray has as many as its cluster has cores.) A worker's copy of the environment holds what it uses of your
+            own modules as it is now.
         verbose: 1 shows a progress bar, 0 nothing.
 
     Raises:
@@ -163,6 +166,8 @@ class _Recipe(NamedTuple):
     """What a worker makes its environment from."""
 
     pickled: bytes
+    computes: str
+    """A digest of what a functional environment computes here."""
     study: str
     """Tells this call of `study` from others, in which the environment may have been another."""
 
@@ -170,19 +175,42 @@ class _Recipe(NamedTuple):
 def _recipe(env: gym.Env | FuncEnv) -> _Recipe:
     """A copy of the environment, or, if it cannot be copied, as after rendering, its spec."""
     try:
-        pickled = cloudpickle.dumps(env)
+        pickled = _pickled_with_its_modules(env)
     except (TypeError, AttributeError, pickle.PicklingError):
         if not (isinstance(env, gym.Env) and env.spec):
             raise
         pickled = cloudpickle.dumps(env.spec)
-    return _Recipe(pickled, uuid.uuid4().hex)
+    return _Recipe(pickled, describe(env)[0].computes, uuid.uuid4().hex)
+
+
+def _pickled_with_its_modules(env: gym.Env | FuncEnv) -> bytes:
+    """With what it uses of the user's modules as it is now, where a worker would import what is on the disk."""
+    modules = [x for x in sys.modules.copy().values() if isinstance(x, ModuleType) and not is_of_a_library(x)]
+    modules = [x for x in modules if sys.modules.get(x.__name__) is x and x.__name__ != "__main__"]
+    for module in modules:
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        return cloudpickle.dumps(env)
+    except Exception:  # something in them cannot be copied, such as a lock
+        pass
+    finally:
+        for module in modules:
+            cloudpickle.unregister_pickle_by_value(module)
+    return cloudpickle.dumps(env)
 
 
 @functools.lru_cache(maxsize=1)
 def _parts(recipe: _Recipe) -> tuple[gym.Env | FuncEnv, dict]:
     """The process's own environment, and the programs compiled for it: made once in a study."""
     env = cloudpickle.loads(recipe.pickled)
-    return gym.make(env) if isinstance(env, gym.envs.registration.EnvSpec) else env, {}
+    if isinstance(env, gym.envs.registration.EnvSpec):
+        env = gym.make(env)
+    if describe(env)[0].computes != recipe.computes:
+        raise ValueError(
+            f"num_workers must be 1 for env {type(env).__name__}, which computes something else in another process: "
+            "a module that was changed after its import is imported there as it is on the disk"
+        )
+    return env, {}
 
 
 def _train_seed(recipe: _Recipe, config: Config, seed: int) -> Outcome | None:

@@ -138,7 +138,7 @@ def train(
         resume: go on from the newest checkpoint in the folder that is whole, or start if there is none yet. The
             result is that of a run that was never interrupted, bit for bit; everything else must be the same, but for a
             num_episodes that may be larger. What callbacks remember is theirs to save. With a checkpoint, functions and
-            classes of your own need a name that can be imported; that and their source tell whether they are the same.
+            classes of your own need a name that can be imported; what they compute tells whether they are the same.
         verbose: 1 prints a line every 100 episodes and one when solved, 2 shows a progress bar beside them, 0 nothing.
 
     Ctrl-C, an interrupted notebook cell and SIGTERM end the run at the end of an episode, saved if there is a

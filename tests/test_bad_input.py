@@ -82,11 +82,12 @@ def network(num_features=2, num_actions=2, weight=None):
     return q_network
 
 
-def learn_from(**fields):
+def learn_from(q_hat_network=None, **fields):
     names = ("states", "actions", "rewards", "next_states", "terminal_states")
     arrays = [np.zeros((8, 2)), np.zeros(8, int), np.zeros(8), np.zeros((8, 2)), np.zeros(8)]
     batch = {**dict(zip(names, arrays, strict=True)), **fields}
-    return learn(tuple(batch.values()), 0.95, *make_networks(2, 2, seed=0), keras.optimizers.Adam())
+    q_network, other = make_networks(2, 2, seed=0)
+    return learn(tuple(batch.values()), 0.95, q_network, q_hat_network or other, keras.optimizers.Adam())
 
 
 OTHERS = {
@@ -122,7 +123,7 @@ OTHERS = {
     "a terminal state of 2": (lambda: learn_from(terminal_states=np.full(8, 2.0)), "terminal_states must be 0 or 1"),
     "a state of NaN": (lambda: learn_from(states=np.full((8, 2), NAN)), "states must be finite"),
     "networks of two shapes": (
-        lambda: learn([np.zeros((8, 2))] * 5, 0.9, network(), network(num_actions=3), keras.optimizers.Adam()),
+        lambda: learn_from(q_hat_network=network(num_actions=3)),
         "q_hat_network must have",
     ),
     "weights of NaN": (lambda: evaluate(Corridor(), network(weight=NAN)), "q_network must have finite weights"),

@@ -73,7 +73,7 @@ def test_a_change_in_whatever_holds_a_number(holder, learning):
 
 SOURCES = {
     "a module's module": "import pkg\ndef loss(y, q):\n    return pkg.settings.K * tf.reduce_mean(tf.square(y - q))",
-    "a name imported within": "def loss(y, q):\n    from pkg.settings import K\n    return K * tf.reduce_mean(tf.square(y - q))",
+    "a name imported within": "def loss(y, q):\n    from pkg.settings import K\n    return K * (y - q) ** 2",
     "a module imported within": "def loss(y, q):\n    import pkg.settings\n    return pkg.settings.K * (y - q) ** 2",
 }
 

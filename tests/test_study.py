@@ -56,6 +56,33 @@ def test_an_environment_that_is_not_registered_goes_to_the_workers_as_it_is():
     assert outcomes.rewards.shape == (3, 50)
 
 
+def test_workers_see_what_was_changed_in_a_module_since_its_import(tmp_path, monkeypatch):
+    (tmp_path / "payment.py").write_text("AMOUNT = 1.0\n")
+    (tmp_path / "paying.py").write_text(
+        "import payment\nfrom tests.environments import Corridor\n"
+        "class Paying(Corridor):\n"
+        "    def step(self, action):\n"
+        "        state, _, *others = super().step(action)\n"
+        "        return state, payment.AMOUNT, *others\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    paying = importlib.import_module("paying")
+    monkeypatch.setattr(paying.payment, "AMOUNT", 7.0)
+    config = Config(num_episodes=3, batch_size=4)
+    outcomes = study(paying.Paying(length=100, limit=4), config, range(2), num_workers=2, verbose=0)
+    assert (outcomes.rewards == 28.0).all()
+    for name in ("paying", "payment"):
+        sys.modules.pop(name)
+
+
+def test_a_change_that_workers_cannot_see_is_refused(monkeypatch):
+    monkeypatch.setattr(importlib.import_module("dqn_keras.environments.cartpole"), "GRAVITY", 30.0)
+    with pytest.raises(ValueError, match=r"^num_workers must be 1 for env CartPole, which computes something else"):
+        study(CartPole(), QUICK, range(2), num_workers=2, verbose=0)
+    run = train(CartPole(), QUICK, 0, verbose=0)
+    np.testing.assert_array_equal(study(CartPole(), QUICK, [0], num_workers=1, verbose=0).rewards[0], run.rewards)
+
+
 @pytest.fixture
 def trained(monkeypatch):
     """The seeds that are trained, in this process."""
