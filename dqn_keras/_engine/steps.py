@@ -36,12 +36,11 @@ _MOST_KEPT = 8
 def compiled_step(
     make_step: Callable[..., Callable], learner: Learner, formulas: Formulas, key: Hashable, batch_size: int, jit: bool
 ) -> Callable[..., list[tf.Tensor]]:
-    """The step that `make_step(learner)` is, compiled for these very objects.
+    """Returns `make_step(learner)`, compiled for these objects; the compiled step is kept until one of them changes.
 
-    It is a function of (states, actions, rewards, next_states, terminal_states, gamma, tau), tensors all, and is found
-    at once from the second call on, until one of the objects changes. `key` tells apart formulas of the package's; with
-    it, the step takes a batch of any size, and with formulas of the user's (None) one of `batch_size`, so that the
-    shapes of what they return can be checked.
+    The step takes seven tensors: states, actions, rewards, next_states, terminal_states, gamma and tau. `key` is None
+    for formulas of the user's. The step then takes a batch of `batch_size` only, so that the shapes which the formulas
+    return can be checked. Otherwise `key` names the package's formulas, and the step takes a batch of any size.
     """
     size = batch_size if key is None else None
     parts = (*learner, *formulas, size, jit)
@@ -72,7 +71,7 @@ def compiled_step(
 
 
 def _is_the_same(a: Any, b: Any) -> bool:
-    """Python makes a method, and may make a string, anew at each use."""
+    """Returns whether two parts are one object; methods, strings and numbers are compared by value."""
     return a is b or (isinstance(a, str | MethodType | int) and a == b)
 
 

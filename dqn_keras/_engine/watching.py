@@ -61,9 +61,7 @@ class Watch:
     def is_unchanged(self) -> bool:
         """Whether all is as it was."""
         try:
-            return all(
-                look() == seen for _, look, seen in self._looks
-            )  # of equal objects `==` asks only their identity
+            return all(look() == seen for _, look, seen in self._looks)
         except Exception:  # arrays and tensors that are other ones cannot be compared like that
             return False
 
