@@ -2,7 +2,7 @@
 
     python -m benchmarks.reliability [--kills 120] > results/reliability.md
 
-What it does is in tests/faults.py and tests/test_config.py; `make test` does the same at a small size. Linux only.
+The faults are in tests/helpers/faults.py and bad_configs.py; `make test` does the same at a small size. Linux only.
 """
 
 import argparse
@@ -28,8 +28,8 @@ from dqn_keras.environments import CartPole
 from dqn_keras.loops import compiled
 from dqn_keras.storage.checkpoint import Checkpoints
 from dqn_keras.storage.identity import identity
-from tests import faults
-from tests.test_config import bad_fields, refused
+from tests.helpers import faults
+from tests.helpers.bad_configs import bad_fields, refused
 
 
 def bad_configs(number: int) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from dqn_keras.environments import CartPole
 from dqn_keras.loops.compiled import episodes as compiled_loop_episodes
 from dqn_keras.loops.gymnasium import episodes
 from dqn_keras.seeding import episode_seed
-from tests import original_algorithm
+from tests.helpers import original_algorithm
 
 CONFIG = Config(epsilon=0.1, epsilon_min=0.1, num_episodes=10**9 // 1000)
 SEED = 0

@@ -49,7 +49,7 @@ SCRIPT = """
 import gymnasium as gym
 from dqn_keras import train
 from dqn_keras.environments import CartPole
-from tests.test_training import QUICK, fingerprint
+from tests.helpers.runs import QUICK, fingerprint
 print(fingerprint(train({env}, QUICK, seed={seed}, verbose=0)))
 """
 

@@ -19,8 +19,8 @@ from dqn_keras.checks.environments import check_spaces
 from dqn_keras.environments import CartPole
 from dqn_keras.environments import cartpole as cartpole_module
 from dqn_keras.loops.compiled import episodes
-from tests import parts
-from tests.parts import NETWORKS, dense, sequential
+from tests.helpers import parts
+from tests.helpers.parts import NETWORKS, dense, sequential
 
 QUICK = Config(num_episodes=5, batch_size=8, max_steps=20, solved_reward=1e6)
 BOTH_LOOPS = pytest.mark.parametrize(

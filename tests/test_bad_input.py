@@ -8,8 +8,7 @@ import pytest
 from dqn_keras import Config, ReplayMemory, action, evaluate, learn, load_agent, make_networks, make_q_network, train
 from dqn_keras.checks.numbers import check_counts
 from dqn_keras.environments import CartPole
-from tests.environments import Corridor
-from tests.test_environment import OldReset, OldStep
+from tests.helpers.environments import Corridor, OldReset, OldStep
 
 NAN, INF = float("nan"), float("inf")
 Box, Discrete = gym.spaces.Box, gym.spaces.Discrete

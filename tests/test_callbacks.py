@@ -10,7 +10,7 @@ import tensorflow as tf
 
 from dqn_keras import Config, evaluate, train
 from dqn_keras.environments import CartPole
-from tests.test_compiled_loop import SpoiledVelocity
+from tests.helpers.runs import SpoiledVelocity
 
 CONFIG = Config(num_episodes=40, batch_size=16, memory_size=300, solved_reward=1e6)
 NAMES = ["reward", "average_reward", "steps", "epsilon", "loss", "mean_q", "max_q", "q_bound", "td_error"]

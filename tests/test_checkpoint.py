@@ -22,10 +22,10 @@ from dqn_keras.storage.checkpoint import Checkpoints
 from dqn_keras.storage.files import from_bytes, to_bytes
 from dqn_keras.storage.identity import identity
 from dqn_keras.storage.networks import save_agent
-from tests import faults
-from tests.environments import Corridor
-from tests.faults import CONFIG, LOOPS, SEED, final_bits, newest, play
-from tests.test_training import Tape, fingerprint
+from tests.helpers import faults
+from tests.helpers.environments import Corridor
+from tests.helpers.faults import CONFIG, LOOPS, SEED, final_bits, newest, play
+from tests.helpers.runs import Tape, fingerprint
 
 QUICK = dataclasses.replace(CONFIG, num_episodes=40)
 
@@ -381,9 +381,10 @@ run = train(gym.make("CartPole-v1"), Config(num_episodes=10**6, solved_reward=1e
 
 
 BITS = """
+import dataclasses
 import sys
-from tests.faults import LOOPS, final_bits, play
-from tests.test_checkpoint import QUICK
+from tests.helpers.faults import CONFIG, LOOPS, final_bits, play
+QUICK = dataclasses.replace(CONFIG, num_episodes=40)
 for loop in LOOPS:
     play(loop, f"{sys.argv[1]}/{loop}", QUICK)
     print(final_bits(f"{sys.argv[1]}/{loop}"))

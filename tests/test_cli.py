@@ -132,7 +132,7 @@ def test_environments_take_arguments_and_wrappers(tmp_path):
     assert load_agent("a/agent.keras").input_shape == (None, 64)
     assert dqn_keras("evaluate a --episodes 2") == 0
     Path("my_environments.py").write_text(
-        "import gymnasium as gym\nfrom tests.environments import Corridor\n"
+        "import gymnasium as gym\nfrom tests.helpers.environments import Corridor\n"
         "gym.register('Corridor-v0', Corridor, max_episode_steps=9)\n"
     )
     assert dqn_keras(f"train my_environments:Corridor-v0 --env-args length=5 --seed 1 {SHORT}") == 0
@@ -296,7 +296,7 @@ def test_nobody_reading_is_no_traceback():
 
 def test_an_error_in_the_environments_own_code_keeps_its_traceback():
     Path("broken.py").write_text(
-        "import gymnasium as gym\nfrom tests.environments import Corridor\n\n"
+        "import gymnasium as gym\nfrom tests.helpers.environments import Corridor\n\n"
         "def reward(t):\n    raise ValueError('the simulator died')\n\n"
         "gym.register('Broken-v0', lambda: Corridor(length=9, reward=reward))\n"
     )

@@ -1,5 +1,4 @@
 import gymnasium as gym
-import keras
 import numpy as np
 import psutil
 import pytest
@@ -17,7 +16,7 @@ from dqn_keras.loops.draws import draw_bits, episode_key, sample_indices, to_int
 from dqn_keras.policy import decay_epsilon
 from dqn_keras.replay import unpack
 from dqn_keras.seeding import draws_key
-from tests.test_training import QUICK, Tape, fingerprint
+from tests.helpers.runs import QUICK, SpoiledVelocity, Tape, fingerprint
 
 START = tf.constant(-(2**62), tf.int64)
 
@@ -239,15 +238,6 @@ class Paying(Counter):
 def test_a_bad_reward_is_told_from_a_bad_observation():
     with pytest.raises(ValueError, match=r"^env Paying: a reward was not finite in episode 0, step 3"):
         train(Paying(), Config(num_episodes=20), seed=0, verbose=0)
-
-
-class SpoiledVelocity(keras.callbacks.Callback):
-    """Makes one weight NaN at the next update, whose loss is finite still."""
-
-    def on_epoch_begin(self, epoch, logs=None):
-        if epoch == 12:
-            velocity = self.model.optimizer.variables[3]
-            velocity.assign(np.where(np.arange(velocity.shape[1]) == 5, np.nan, velocity.numpy()))
 
 
 @pytest.mark.parametrize("make_env", [CartPole, lambda: gym.make("CartPole-v1")])

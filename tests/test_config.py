@@ -3,12 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
 
 from dqn_keras import Config
+from tests.helpers.bad_configs import SHARES, bad_fields, bad_hidden_units, refused
 
-COUNTS = ["memory_size", "steps_per_update", "batch_size", "num_episodes", "max_steps", "solved_window"]
-SHARES = ["alpha", "gamma", "tau", "epsilon", "decay", "epsilon_min"]
 ZERO_IS_FINE = ["gamma", "epsilon", "epsilon_min"]
 
 
@@ -30,31 +28,6 @@ def test_defaults_are_the_originals_numbers():
         "hidden_units": (64,),
         "jit_compile": True,
     }
-
-
-def refused(name, value):
-    with pytest.raises((TypeError, ValueError)) as caught:
-        Config(**{name: value})
-    message = str(caught.value)
-    assert message.startswith(name), message
-    assert repr(value) in message, message
-
-
-not_numbers = st.sampled_from([None, "64", b"1", True, False, np.True_, [1], (), {}, 1j, object()])
-not_finite = st.sampled_from([float("nan"), float("inf"), -float("inf"), np.float32("nan"), np.float64("inf")])
-
-
-bad_counts = st.one_of(not_numbers, not_finite, st.floats(), st.integers(max_value=0), st.just(2**31))
-bad_shares = st.one_of(
-    not_numbers, not_finite, st.floats(max_value=-1e-300), st.floats(min_value=1.0001), st.just(10**400)
-)
-bad_hidden_units = st.one_of(not_finite, st.lists(bad_counts, min_size=1, max_size=3).map(tuple))
-bad_fields = st.one_of(
-    st.tuples(st.sampled_from(COUNTS), bad_counts),
-    st.tuples(st.sampled_from(SHARES), bad_shares),
-    st.tuples(st.just("solved_reward"), st.one_of(not_numbers, not_finite)),
-    st.tuples(st.just("jit_compile"), st.sampled_from([1, 0, None, "yes", 1.0, np.int64(1)])),
-)
 
 
 @given(bad_fields)

@@ -13,7 +13,7 @@ from dqn_keras.checks.formulas import Formulas
 from dqn_keras.environments import Acrobot, CartPole
 from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, double_td_targets
 from dqn_keras.metrics import Episode, Log, checked_step, sum_up
-from tests.environments import Corridor
+from tests.helpers.environments import Corridor
 
 
 @pytest.mark.parametrize("is_double", [False, True], ids=["DQN", "Double DQN"])

@@ -4,19 +4,7 @@ import pytest
 
 from dqn_keras import train
 from dqn_keras.checks.environments import CheckedEnv
-from tests.environments import Corridor
-
-
-class OldReset(Corridor):
-    def reset(self, *, seed=None, options=None):
-        return super().reset(seed=seed)[0]
-
-
-class OldStep(Corridor):
-    def step(self, action):
-        observation, reward, terminated, _, info = super().step(action)
-        return observation, reward, terminated, info
-
+from tests.helpers.environments import Corridor, OldReset, OldStep
 
 MISBEHAVING = {
     "reset of the old API": (OldReset(), r"env OldReset: reset\(\) must return \(observation, info\)"),

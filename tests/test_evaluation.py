@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from dqn_keras import Config, evaluate, make_q_network, train
-from tests.environments import Corridor
+from tests.helpers.environments import Corridor
 
 
 def always(action):

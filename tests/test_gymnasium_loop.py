@@ -8,8 +8,8 @@ from dqn_keras.agent import make_agent
 from dqn_keras.checks.environments import CheckedEnv
 from dqn_keras.loops.gymnasium import episodes
 from dqn_keras.seeding import episode_seed
-from tests import original_algorithm
-from tests.environments import Corridor
+from tests.helpers import original_algorithm
+from tests.helpers.environments import Corridor
 
 
 class Recorded(gym.Wrapper):

@@ -50,6 +50,12 @@ def test_imports_run_one_way():
         assert name not in {x for module in imported_by(name) for x in {module, *reached_from(module)}}, name
 
 
+def test_nothing_imports_a_file_of_tests():
+    root = Path(__file__).parent.parent
+    for path in [*root.glob("tests/**/*.py"), *root.glob("benchmarks/*.py")]:
+        assert not re.search(r"^(from|import) tests\.test_", path.read_text(), re.MULTILINE), path
+
+
 def test_private_api_of_tensorflow_and_keras_is_in_one_room():
     private = re.compile(
         r"\b(inference_fn|call_flat|gradient_registry|tensorflow\.python|keras\.src\.|value\.handle)\b"

@@ -9,7 +9,7 @@ import pytest
 
 from dqn_keras import Config, evaluate, learn, train
 from dqn_keras._engine.private import all_layers, walk
-from tests.parts import INFERENCE_ONLY, LOSSES, NETWORKS, OPTIMIZERS, eager_step
+from tests.helpers.parts import INFERENCE_ONLY, LOSSES, NETWORKS, OPTIMIZERS, eager_step
 
 GAMMA, TAU, NUM_STEPS = 0.9, 0.2, 5
 ALL_NETWORKS = NETWORKS | INFERENCE_ONLY

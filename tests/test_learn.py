@@ -12,7 +12,7 @@ import tensorflow as tf
 from dqn_keras import Config, Experience, learn, loss_values, make_networks, train, update_q_hat
 from dqn_keras._engine.programs import _shared
 from dqn_keras.environments import CartPole
-from tests.oracle import Oracle
+from tests.helpers.oracle import Oracle
 
 
 def agent(seed=0, alpha=0.001):

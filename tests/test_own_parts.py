@@ -13,7 +13,7 @@ from gymnasium.wrappers import FlattenObservation, TimeLimit
 from dqn_keras import Config, Experience, ReplayMemory, evaluate, load_agent, make_networks, train
 from dqn_keras.environments import CartPole
 from dqn_keras.replay import pack, unpack
-from tests.environments import Corridor
+from tests.helpers.environments import Corridor
 
 QUICK = Config(num_episodes=6, batch_size=16, max_steps=40, solved_reward=1e6)
 

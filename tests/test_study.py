@@ -17,7 +17,7 @@ from scipy import stats
 from dqn_keras import Config, Study, compare, episode_seed, load_study, plot_study, study, summarize, train
 from dqn_keras.environments import CartPole
 from dqn_keras.study import Outcome
-from tests.environments import Corridor
+from tests.helpers.environments import Corridor
 
 module = importlib.import_module("dqn_keras.study")  # `dqn_keras.study` is the function
 QUICK = Config(num_episodes=30, batch_size=16, solved_reward=1000)
@@ -59,7 +59,7 @@ def test_an_environment_that_is_not_registered_goes_to_the_workers_as_it_is():
 def test_workers_see_what_was_changed_in_a_module_since_its_import(tmp_path, monkeypatch):
     (tmp_path / "payment.py").write_text("AMOUNT = 1.0\n")
     (tmp_path / "paying.py").write_text(
-        "import payment\nfrom tests.environments import Corridor\n"
+        "import payment\nfrom tests.helpers.environments import Corridor\n"
         "class Paying(Corridor):\n"
         "    def step(self, action):\n"
         "        state, _, *others = super().step(action)\n"

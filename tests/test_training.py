@@ -1,5 +1,4 @@
 import csv
-import hashlib
 
 import gymnasium as gym
 import keras
@@ -7,15 +6,8 @@ import numpy as np
 import pytest
 
 from dqn_keras import Config, train
-from tests.environments import Corridor
-
-QUICK = Config(num_episodes=30, batch_size=16, solved_reward=1000)
-
-
-def fingerprint(run):
-    arrays = [*run.q_network.get_weights(), *run.q_hat_network.get_weights()]
-    arrays += [v.numpy() for v in run.agent.optimizer.variables]
-    return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in [*arrays, run.rewards])).hexdigest()
+from tests.helpers.environments import Corridor
+from tests.helpers.runs import QUICK, Tape, fingerprint
 
 
 def test_cartpole_is_solved_in_the_originals_way(cartpole, capsys):
@@ -69,26 +61,6 @@ def test_the_global_random_state_is_neither_read_nor_set(cartpole):
 def test_verbose_zero_prints_nothing(cartpole, capfd):
     train(cartpole, QUICK, seed=0, verbose=0)
     assert capfd.readouterr().out == ""
-
-
-class Tape(keras.callbacks.Callback):
-    def __init__(self, stop_after=None):
-        super().__init__()
-        self.stop_after, self.calls = stop_after, []
-
-    def on_train_begin(self, logs=None):
-        self.calls.append("train begins")
-
-    def on_epoch_begin(self, epoch, logs=None):
-        self.calls.append(("begins", epoch))
-
-    def on_epoch_end(self, epoch, logs=None):
-        self.calls.append(("ends", epoch))
-        self.logs = logs
-        self.model.stop_training = epoch == self.stop_after
-
-    def on_train_end(self, logs=None):
-        self.calls.append("train ends")
 
 
 def test_an_episode_is_an_epoch_to_keras_callbacks(cartpole):

@@ -89,7 +89,7 @@ def _die_in_save(num_saves, num_lines, share):
 def child_process(target, *arguments):
     """A process that has imported the package already, and nothing more."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["dqn_keras", "tests.faults"])
+    context.set_forkserver_preload(["dqn_keras", "tests.helpers.faults"])
     started = context.Event()
     process = context.Process(target=target, args=(*arguments[:2], started, *arguments[2:]))
     process.start()

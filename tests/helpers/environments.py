@@ -31,3 +31,18 @@ class Corridor(gym.Env):
         terminated = self._end(self.t) if self._end else self.position >= self.length
         truncated = self.limit is not None and self.t >= self.limit
         return self._observe(self.position, self.t), self._reward(self.t - 1), terminated, truncated, {}
+
+
+class OldReset(Corridor):
+    """Its `reset` returns no info."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed)[0]
+
+
+class OldStep(Corridor):
+    """Its `step` returns `done`, as Gym's did."""
+
+    def step(self, action):
+        observation, reward, terminated, _, info = super().step(action)
+        return observation, reward, terminated, info
