@@ -10,10 +10,11 @@ import numpy as np
 
 from dqn_keras._engine.copies import copy
 from dqn_keras._engine.programs import Learner
+from dqn_keras._engine.recycling import recycled
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.config import Config
 from dqn_keras.metrics import Episode
-from dqn_keras.networks import make_networks, renew_weights
+from dqn_keras.networks import make_networks
 from dqn_keras.replay import ReplayMemory
 from dqn_keras.seeding import _derived
 
@@ -65,9 +66,8 @@ def make_agent(
     """
     sizes = (*state_shape, *config.hidden_units, num_actions)
     is_default = q_network is None and optimizer is None and loss == "mse"
-    if is_default and (learner := _recycled.pop(sizes, None)):
-        _renew(learner, config, seed)
-    else:
+    learner = recycled(sizes, config.alpha, _derived(seed, 0)) if is_default else None
+    if learner is None:
         if q_network is None:
             (num_features,) = state_shape
             networks = make_networks(num_features, num_actions, config.hidden_units, _derived(seed, 0))
@@ -128,21 +128,3 @@ def optimizer_shown(agent: Agent) -> Iterator[None]:
         yield
     finally:
         network.optimizer = owners
-
-
-_recycled: dict[tuple[int, ...], Learner] = {}
-
-
-def recycle(agent: Agent) -> None:
-    """Gives up an agent, whose networks the next one of its sizes is made in: to build them takes a while."""
-    if sizes := agent.learner.sizes():
-        _recycled[sizes] = agent.learner
-
-
-def _renew(learner: Learner, config: Config, seed: int) -> None:
-    """Puts networks and optimizer back to how they are made for `seed`."""
-    renew_weights(learner.q_network, _derived(seed, 0))
-    learner.q_hat_network.set_weights(learner.q_network.get_weights())
-    for variable in learner.optimizer.variables:
-        variable.assign(np.zeros(variable.shape, variable.dtype))
-    learner.optimizer.learning_rate = config.alpha

@@ -25,8 +25,8 @@ from joblib import Parallel, cpu_count, delayed, parallel_config
 
 from dqn_keras._engine.libraries import is_of_a_library
 from dqn_keras._engine.programs import shared_in
+from dqn_keras._engine.recycling import recycle
 from dqn_keras._engine.tensorflow import tf
-from dqn_keras.agent import recycle
 from dqn_keras.checks.numbers import check_count
 from dqn_keras.checks.run import check_arguments
 from dqn_keras.config import Config
@@ -134,7 +134,7 @@ def study(
     missing = [seed for seed in seeds if seed not in outcomes]
     bar = tqdm(total=len(seeds), initial=len(seeds) - len(missing), unit="seed", disable=not verbose)
     saved_at, interrupted = time.monotonic(), False
-    with bar, contextlib.closing(_ENGINES[engine](_recipe(env), config, missing, num_workers)) as results:
+    with bar, contextlib.closing(_ENGINES[engine](_pickled_env(env), config, missing, num_workers)) as results:
         try:
             for outcome in results:
                 if outcome is None:  # a run in this process was asked to stop
@@ -162,7 +162,7 @@ _SECONDS_BETWEEN_SAVES = 10
 _Results = Generator[Outcome | None, None, None]
 
 
-class _Recipe(NamedTuple):
+class _PickledEnv(NamedTuple):
     """What a worker makes its environment from."""
 
     pickled: bytes
@@ -172,7 +172,7 @@ class _Recipe(NamedTuple):
     """Tells this call of `study` from others, in which the environment may have been another."""
 
 
-def _recipe(env: gym.Env | FuncEnv) -> _Recipe:
+def _pickled_env(env: gym.Env | FuncEnv) -> _PickledEnv:
     """A copy of the environment, or, if it cannot be copied, as after rendering, its spec."""
     try:
         pickled = _pickled_with_its_modules(env)
@@ -180,7 +180,7 @@ def _recipe(env: gym.Env | FuncEnv) -> _Recipe:
         if not (isinstance(env, gym.Env) and env.spec):
             raise
         pickled = cloudpickle.dumps(env.spec)
-    return _Recipe(pickled, describe(env)[0].computes, uuid.uuid4().hex)
+    return _PickledEnv(pickled, describe(env)[0].computes, uuid.uuid4().hex)
 
 
 def _pickled_with_its_modules(env: gym.Env | FuncEnv) -> bytes:
@@ -200,12 +200,12 @@ def _pickled_with_its_modules(env: gym.Env | FuncEnv) -> bytes:
 
 
 @functools.lru_cache(maxsize=1)
-def _parts(recipe: _Recipe) -> tuple[gym.Env | FuncEnv, dict]:
+def _parts(env_copy: _PickledEnv) -> tuple[gym.Env | FuncEnv, dict]:
     """The process's own environment, and the programs compiled for it: made once in a study."""
-    env = cloudpickle.loads(recipe.pickled)
+    env = cloudpickle.loads(env_copy.pickled)
     if isinstance(env, gym.envs.registration.EnvSpec):
         env = gym.make(env)
-    if describe(env)[0].computes != recipe.computes:
+    if describe(env)[0].computes != env_copy.computes:
         raise ValueError(
             f"num_workers must be 1 for env {type(env).__name__}, which computes something else in another process: "
             "a module that was changed after its import is imported there as it is on the disk"
@@ -213,9 +213,9 @@ def _parts(recipe: _Recipe) -> tuple[gym.Env | FuncEnv, dict]:
     return env, {}
 
 
-def _train_seed(recipe: _Recipe, config: Config, seed: int) -> Outcome | None:
+def _train_seed(env_copy: _PickledEnv, config: Config, seed: int) -> Outcome | None:
     """One agent, in whatever process; None if it was interrupted there."""
-    env, programs = _parts(recipe)
+    env, programs = _parts(env_copy)
     with shared_in(programs):
         run = train(env, config, seed, verbose=0)
     if run.interrupted:
@@ -223,24 +223,24 @@ def _train_seed(recipe: _Recipe, config: Config, seed: int) -> Outcome | None:
     weights = [*run.q_network.get_weights(), *run.q_hat_network.get_weights()]
     digest = hashlib.sha256(b"".join(w.tobytes() for w in weights)).digest()
     steps = np.array([episode.steps for episode in run.episodes], np.int64)
-    recycle(run.agent)
+    recycle(run.agent.learner)
     return Outcome(seed, run.rewards, steps, run.solved_at, digest)
 
 
-def _train_seed_in_worker(recipe: _Recipe, config: Config, seed: int) -> Outcome | None:
+def _train_seed_in_worker(env_copy: _PickledEnv, config: Config, seed: int) -> Outcome | None:
     """The same in a process of its own. TensorFlow gets one thread there: there is a process for each core."""
     with contextlib.suppress(RuntimeError):  # it has started already, in a worker that someone else has used
         tf.config.threading.set_intra_op_parallelism_threads(1)
-    return _train_seed(recipe, config, seed)
+    return _train_seed(env_copy, config, seed)
 
 
-def _by_joblib(recipe: _Recipe, config: Config, seeds: list[int], num_workers: int) -> _Results:
+def _by_joblib(env_copy: _PickledEnv, config: Config, seeds: list[int], num_workers: int) -> _Results:
     if num_workers == 1 or len(seeds) <= 1:
-        yield from (_train_seed(recipe, config, seed) for seed in seeds)
+        yield from (_train_seed(env_copy, config, seed) for seed in seeds)
         return
     with parallel_config(backend="loky", inner_max_num_threads=1), _interrupts_ignored_by_children():
         parallel = Parallel(n_jobs=min(num_workers, len(seeds)), batch_size=1, return_as="generator_unordered")
-        results = parallel(delayed(_train_seed_in_worker)(recipe, config, seed) for seed in seeds)
+        results = parallel(delayed(_train_seed_in_worker)(env_copy, config, seed) for seed in seeds)
     yield from results
 
 
@@ -257,7 +257,7 @@ def _interrupts_ignored_by_children() -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
 
 
-def _by_ray(recipe: _Recipe, config: Config, seeds: list[int], _: int) -> _Results:
+def _by_ray(env_copy: _PickledEnv, config: Config, seeds: list[int], _: int) -> _Results:
     try:
         import ray
     except ImportError:
@@ -266,7 +266,7 @@ def _by_ray(recipe: _Recipe, config: Config, seeds: list[int], _: int) -> _Resul
     if is_ours:
         ray.init(include_dashboard=False, log_to_driver=False)
     task = ray.remote(max_retries=3)(_train_seed_in_worker)
-    waiting = [task.remote(recipe, config, seed) for seed in seeds]
+    waiting = [task.remote(env_copy, config, seed) for seed in seeds]
     try:
         while waiting:
             done, waiting = ray.wait(waiting)
@@ -282,18 +282,12 @@ _ENGINES = {"joblib": _by_joblib, "ray": _by_ray}
 
 
 def _save(path: Path, outcomes: dict[int, Outcome], facts: dict[str, Any]) -> None:
-    columns = [outcomes[seed] for seed in sorted(outcomes)]
-    arrays = {
-        "seeds": np.array([o.seed for o in columns], np.int64),
-        "num_episodes": np.array([len(o.rewards) for o in columns], np.int64),
-        "solved_at": np.array([-1 if o.solved_at is None else o.solved_at for o in columns], np.int64),
-        "digests": np.array([list(o.digest) for o in columns], np.uint8).reshape(-1, 32),
-        "rewards": np.concatenate([np.zeros(0), *(o.rewards for o in columns)]),
-        "steps": np.concatenate([np.zeros(0, np.int64), *(o.steps for o in columns)]),
-    }
+    ordered = [outcomes[seed] for seed in sorted(outcomes)]
+    columns = {f"{o.seed}/{name}": getattr(o, name) for o in ordered for name in ("rewards", "steps")}
+    seeds = [(o.seed, o.solved_at, o.digest.hex()) for o in ordered]
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
-        temporary.write_bytes(to_bytes(arrays, facts))
+        temporary.write_bytes(to_bytes(columns, {**facts, "seeds": seeds}))
 
 
 def _load(path: Path, facts: dict[str, Any]) -> dict[int, Outcome]:
@@ -308,17 +302,11 @@ def _load(path: Path, facts: dict[str, Any]) -> dict[int, Outcome]:
 
 def _read(path: Path) -> tuple[dict[int, Outcome], dict[str, Any]]:
     try:
-        arrays, facts = from_bytes(path.read_bytes())
-        seeds, ends = arrays["seeds"].tolist(), np.cumsum(arrays["num_episodes"])
-        columns = zip(
-            seeds,
-            np.split(arrays["rewards"], ends)[: len(seeds)],
-            np.split(arrays["steps"], ends)[: len(seeds)],
-            [None if k < 0 else k for k in arrays["solved_at"].tolist()],
-            [digest.tobytes() for digest in arrays["digests"]],
-            strict=True,
-        )
-        return {column[0]: Outcome(*column) for column in columns}, facts
+        columns, facts = from_bytes(path.read_bytes())
+        return {
+            seed: Outcome(seed, columns[f"{seed}/rewards"], columns[f"{seed}/steps"], solved_at, bytes.fromhex(digest))
+            for seed, solved_at, digest in facts["seeds"]
+        }, facts
     except (ValueError, KeyError) as error:
         raise ValueError(f"file {path} is not a study that can be loaded: {error}") from error
 

@@ -88,9 +88,9 @@ def trained(monkeypatch):
     """The seeds that are trained, in this process."""
     seeds, train_seed = [], module._train_seed
 
-    def note_and_train(recipe, config, seed):
+    def note_and_train(env_copy, config, seed):
         seeds.append(seed)
-        return train_seed(recipe, config, seed)
+        return train_seed(env_copy, config, seed)
 
     monkeypatch.setattr(module, "_train_seed", note_and_train)
     return seeds
@@ -121,11 +121,11 @@ def test_the_same_study_again_does_only_what_is_missing(tmp_path, trained):
 def test_an_interrupted_run_in_this_process_ends_the_study_with_what_is_finished(tmp_path, monkeypatch, trained):
     file, train_seed = tmp_path / "study.npz", module._train_seed
 
-    def interrupted_in_the_third(recipe, config, seed):
+    def interrupted_in_the_third(env_copy, config, seed):
         if seed == 2 and len(trained) == 2:
             threading.Timer(0.05, signal.raise_signal, [signal.SIGINT]).start()
             config = dataclasses.replace(config, num_episodes=10**6)
-        return train_seed(recipe, config, seed)
+        return train_seed(env_copy, config, seed)
 
     monkeypatch.setattr(module, "_train_seed", interrupted_in_the_third)
     with pytest.warns(UserWarning, match=r"^3 of 5 seeds are not in this study: it was interrupted"):

@@ -11,7 +11,7 @@ import numpy as np
 
 from dqn_keras.checks.numbers import check_count
 from dqn_keras.cli import run_folder
-from dqn_keras.cli.run_folder import Recipe, Settings
+from dqn_keras.cli.run_folder import EnvOptions, Settings
 from dqn_keras.evaluation import evaluate as play_greedily
 from dqn_keras.rendering import record_episode, save_animation
 from dqn_keras.seeding import checked_seed
@@ -27,7 +27,7 @@ def train(options: "cli.Train") -> int:
     """Train in a new folder."""
     seed = checked_seed(options.seed)
     folder = options.out or _default_folder(options.env, str(seed))
-    settings = Settings(_recipe(options), seed, options.config, options.tensorboard)
+    settings = Settings(_env_options(options), seed, options.config, options.tensorboard)
     return _tell(run_folder.begin(folder, settings, _verbosity(options.quiet)), folder, options.quiet)
 
 
@@ -42,11 +42,11 @@ def watch(options: "cli.Watch") -> int:
     settings, network = run_folder.read_settings(options.folder), run_folder.read_agent(options.folder)
     max_steps = settings.config.max_steps
     if _has_display() and not options.gif:
-        with contextlib.closing(settings.recipe.make(render_mode="human")) as env:
+        with contextlib.closing(settings.env.make(render_mode="human")) as env:
             _print_returns(play_greedily(env, network, options.episodes, options.seed, max_steps))
         return 0
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pictures are drawn without a display
-    with contextlib.closing(settings.recipe.make(render_mode="rgb_array")) as env:
+    with contextlib.closing(settings.env.make(render_mode="rgb_array")) as env:
         frames = record_episode(env, network, options.seed, max_steps)
         fps = env.metadata.get("render_fps", 30)
     path = options.folder / "episode.gif"
@@ -58,7 +58,7 @@ def watch(options: "cli.Watch") -> int:
 def evaluate(options: "cli.Evaluate") -> int:
     """Play greedily."""
     settings, network = run_folder.read_settings(options.folder), run_folder.read_agent(options.folder)
-    with contextlib.closing(settings.recipe.make()) as env:
+    with contextlib.closing(settings.env.make()) as env:
         _print_returns(play_greedily(env, network, options.episodes, options.seed, settings.config.max_steps))
     return 0
 
@@ -71,17 +71,17 @@ def study(options: "cli.Study") -> int:
             f"num_episodes must be at least solved_window={options.config.solved_window} in a study, whose curves are "
             f"means over it, got {options.config.num_episodes}"
         )
-    outcome = train_seeds(
-        _recipe(options).make_for_training(),
+    trained = train_seeds(
+        _env_options(options).make_for_training(),
         options.config,
         range(check_count("seeds", options.seeds)),
         file=folder / "study.npz",
         num_workers=options.workers,
         verbose=0 if options.quiet else 1,
     )
-    if len(outcome.outcomes) < options.seeds:
+    if len(trained.outcomes) < options.seeds:
         return _interrupted("the same command again")
-    summary = summarize(outcome)
+    summary = summarize(trained)
     print(f"Share of seeds solved within {options.config.num_episodes:,} episodes: {summary.share_solved}")
     print(f"Episodes to solved: median {summary.median}, mean of the middle half {summary.interquartile_mean}")
     print(f"The numbers in brackets are 95 % intervals; the curves are in {run_folder.draw(folder)}")
@@ -94,8 +94,8 @@ def plot(options: "cli.Plot") -> int:
     return 0
 
 
-def _recipe(options: "cli.Train | cli.Study") -> Recipe:
-    return Recipe.parse(options.env, options.env_args, options.flatten, options.compiled)
+def _env_options(options: "cli.Train | cli.Study") -> EnvOptions:
+    return EnvOptions.parse(options.env, options.env_args, options.flatten, options.compiled)
 
 
 def _default_folder(env_id: str, name: str) -> Path:

@@ -3,9 +3,7 @@
 TensorFlow and Gymnasium are not imported before a command is run, so that `--help` is there at once.
 """
 
-import contextlib
 import dataclasses
-import io
 import os
 import re
 import shlex
@@ -13,7 +11,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
@@ -27,13 +25,21 @@ Flag = FlagCreatePairsOff[bool]
 Folder = Annotated[Positional[Path], arg(metavar="FOLDER")]
 
 
+@dataclasses.dataclass(frozen=True)
+class _Unchecked(Config):
+    """The parameters as they were typed. Config checks them, with messages that need no box of tyro's around them."""
+
+    def __post_init__(self) -> None:
+        """Checks nothing."""
+
+
 @dataclasses.dataclass(kw_only=True)
 class _Task:
     """An environment, and how to learn it."""
 
     env: Annotated[Positional[str], arg(metavar="ENV")]
     """Id of a Gymnasium environment, such as CartPole-v1; MODULE:ID imports the module that registers it."""
-    config: OmitArgPrefixes[Config] = Config()
+    config: OmitArgPrefixes[_Unchecked] = _Unchecked()
     """The parameters of the algorithm; the defaults are the original notebook's."""
     env_args: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE ...", help_behavior_hint="(default: none)")] = ()
     """Arguments of gymnasium.make, such as is_slippery=False map_name=8x8."""
@@ -120,8 +126,14 @@ class Plot:
     """Of the run or the study; the picture goes there, as curve.png or study.png."""
 
 
+_COMMANDS: Any = Train | Resume | Watch | Evaluate | Study | Plot
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line: -> 0, 2 after an error (one line on standard error), or 130 after Ctrl-C."""
+    """Runs the command line and returns its exit code: 0, 2 after an error, 130 after Ctrl-C, 141 after a broken pipe.
+
+    An error is one line on standard error; about an option that cannot be read, a box with the help of that option.
+    """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments == ["--version"]:
         print(f"dqn_keras {__version__}")
@@ -132,13 +144,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.path.append(os.getcwd())  # where MODULE:ID looks, however this was started
     command = None
     try:
-        command = _parse(arguments)
-        if isinstance(command, int):
-            return command
+        command = tyro.cli(
+            _COMMANDS,
+            prog="dqn-keras",
+            description="Train Deep Q-Networks on Gymnasium's environments.",
+            args=arguments,
+        )
+        if isinstance(command, _Task):
+            command.config = cast(Any, Config(**vars(command.config)))
         from dqn_keras.cli import commands
 
         warnings.formatwarning = lambda message, *_: f"dqn-keras: {_in_plain_text(str(message))}\n"
         return getattr(commands, type(command).__name__.lower())(command)
+    except SystemExit as end:  # tyro has printed the help, or what is wrong
+        return int(end.code or 0)
     except KeyboardInterrupt:
         print(f"Interrupted{_how_to_go_on(command)}", file=sys.stderr)
         return 130
@@ -161,10 +180,9 @@ def _how_to_go_on(command: Any) -> str:
 
 def _says_it_all(error: Exception) -> bool:
     """Whether the message is enough; an error in an environment's own code (which has a note) needs its traceback."""
-    import gymnasium as gym
-
-    known = (ValueError, TypeError, OSError, ImportError, gym.error.Error)
-    return isinstance(error, known) and not hasattr(error, "__notes__")
+    is_known = isinstance(error, ValueError | TypeError | OSError | ImportError)
+    is_known |= type(error).__module__ == "gymnasium.error"
+    return is_known and not hasattr(error, "__notes__")
 
 
 def _error(message: str) -> int:
@@ -175,28 +193,3 @@ def _error(message: str) -> int:
 def _in_plain_text(message: str) -> str:
     """One line, without the colours of a terminal."""
     return " ".join(re.sub(r"\x1b\[[0-9;]*m", "", message).split())
-
-
-def _parse(arguments: Sequence[str]) -> Any:
-    """The command; or, after `--help` or an error, the exit code."""
-    said = io.StringIO()
-    commands: Any = Train | Resume | Watch | Evaluate | Study | Plot
-    try:
-        with contextlib.redirect_stderr(said):
-            return tyro.cli(
-                commands,
-                prog="dqn-keras",
-                description="Train Deep Q-Networks on Gymnasium's environments.",
-                args=arguments,
-            )
-    except SystemExit as end:
-        return _error(_in_one_line(said.getvalue())) if end.code else 0
-
-
-def _in_one_line(box: str) -> str:
-    """What tyro says in a box of several lines."""
-    text = " ".join(line.strip("│ ") for line in box.splitlines() if line.startswith("│"))
-    problem, *advice = re.split(r"\s*─{3,}\s*", text)
-    problem = re.sub(r"^Error parsing (__tyro\S+ )?", "", problem)
-    meant = re.match(r"Perhaps you meant: (\S+)", advice[0]) if advice else None
-    return f"{problem}{f'; perhaps you meant {meant[1]}' if meant else ''} (see dqn-keras --help)"

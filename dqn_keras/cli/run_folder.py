@@ -4,6 +4,7 @@ import ast
 import contextlib
 import csv
 import dataclasses
+import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +28,7 @@ from dqn_keras.training import Run, train
 
 
 @dataclasses.dataclass(frozen=True)
-class Recipe:
+class EnvOptions:
     """What an environment is made from."""
 
     id: str
@@ -36,7 +37,7 @@ class Recipe:
     compiled: bool
 
     @classmethod
-    def parse(cls, id: str, arguments: Sequence[str], flatten: bool, compiled: bool) -> "Recipe":
+    def parse(cls, id: str, arguments: Sequence[str], flatten: bool, compiled: bool) -> "EnvOptions":
         """Of the command line's words; ValueError if there is no such functional twin, or a word is no assignment."""
         if compiled and (id not in environments.TWINS or arguments or flatten):
             raise ValueError(
@@ -80,7 +81,7 @@ class Recipe:
 class Settings:
     """What config.json holds."""
 
-    recipe: Recipe
+    env: EnvOptions
     seed: int
     config: Config
     tensorboard: bool
@@ -89,7 +90,7 @@ class Settings:
 def write_settings(folder: Path, settings: Settings) -> None:
     """Write config.json, with the versions that the run is made with."""
     content = {
-        "environment": dataclasses.asdict(settings.recipe),
+        "environment": dataclasses.asdict(settings.env),
         "seed": settings.seed,
         "config": dataclasses.asdict(settings.config),
         "tensorboard": settings.tensorboard,
@@ -107,8 +108,8 @@ def read_settings(folder: Path) -> Settings:
     try:
         content = json.loads(path.read_text())
         config = {**content["config"], "hidden_units": tuple(content["config"]["hidden_units"])}
-        recipe = Recipe(**content["environment"])
-        return Settings(recipe, content["seed"], Config(**config), content["tensorboard"])
+        env = EnvOptions(**content["environment"])
+        return Settings(env, content["seed"], Config(**config), content["tensorboard"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not as `dqn-keras train` writes it: {error}") from None
 
@@ -128,7 +129,7 @@ def begin(folder: Path, settings: Settings, verbose: int) -> Run:
         raise ValueError(
             f"{folder} holds a run already: `dqn-keras resume {folder}` goes on with it, another --out begins anew"
         )
-    env = settings.recipe.make_for_training()
+    env = settings.env.make_for_training()
     check_environment(env)  # before there is a folder
     folder.mkdir(parents=True, exist_ok=True)
     write_settings(folder, settings)
@@ -141,7 +142,7 @@ def resume(folder: Path, num_episodes: int | None, verbose: int) -> Run:
     if num_episodes is not None:
         config = dataclasses.replace(settings.config, num_episodes=num_episodes)
         settings = dataclasses.replace(settings, config=config)
-    env = settings.recipe.make_for_training()
+    env = settings.env.make_for_training()
     write_settings(folder, settings)
     try:
         return _train(folder, env, settings, verbose, resume=True)
@@ -157,7 +158,9 @@ def _train(folder: Path, env: Any, settings: Settings, verbose: int, resume: boo
     except filelock.Timeout:
         raise ValueError(f"{folder} is in use: another process trains there") from None
     with lock:
-        _write_rows(log, _read_rows(log))  # whole lines only, so that it can be gone on with
+        if log.exists():  # a kill may have torn its last line
+            content = log.read_bytes()
+            log.write_bytes(content[: content.rfind(b"\n") + 1])
         callbacks = [keras.callbacks.CSVLogger(log, append=True)]
         if settings.tensorboard:
             callbacks.append(keras.callbacks.TensorBoard(folder / "tensorboard"))
@@ -170,40 +173,29 @@ def _train(folder: Path, env: Any, settings: Settings, verbose: int, resume: boo
             resume=resume,
             verbose=verbose,
         )
-        columns = zip(*run.history.values(), strict=True)
-        known = {episode: dict(zip(run.history, row, strict=True)) for episode, row in enumerate(columns)}
-        _write_rows(log, {**known, **_read_rows(log)})
+        _write_log(log, run.history)
         run.save(folder / "agent.keras")
         draw(folder)
     return run
 
 
-def _read_rows(log: Path) -> dict[int, dict[str, float]]:
-    """By episode; of one that was played again after a kill the last row, and none that is not whole."""
-    rows: dict[int, dict[str, float]] = {}
-    if log.exists():
-        with log.open(newline="") as file:
-            for row in csv.DictReader(file):
-                with contextlib.suppress(KeyError, TypeError, ValueError):
-                    values = {name: float(row[name]) for name in LOGGED}
-                    rows[int(row["epoch"])] = {**values, "steps": int(values["steps"])}
-    return rows
-
-
-def _write_rows(log: Path, rows: dict[int, dict[str, float]]) -> None:
-    """As keras.callbacks.CSVLogger writes them."""
-    if not rows:
-        log.unlink(missing_ok=True)
-        return
+def _write_log(log: Path, history: dict[str, list[float]]) -> None:
+    """Writes log.csv as keras.callbacks.CSVLogger does, from what the checkpoint keeps: without repeats or gaps."""
+    names = sorted(history)
     with replacing(log) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["epoch", *sorted(LOGGED)])
-        writer.writeheader()
-        writer.writerows({"epoch": episode, **rows[episode]} for episode in sorted(rows))
+        writer = csv.writer(file)
+        writer.writerow(["epoch", *names])
+        writer.writerows(zip(itertools.count(), *(history[name] for name in names), strict=False))
 
 
 def read_log(folder: Path) -> dict[str, list[float]]:
-    """What log.csv holds, as `run.history`."""
-    rows = _read_rows(folder / "log.csv")
+    """Returns what log.csv holds, as `run.history`; of an episode that was played again after a kill, the last row."""
+    rows: dict[int, dict[str, float]] = {}
+    if (folder / "log.csv").exists():
+        with (folder / "log.csv").open(newline="") as file:
+            for row in csv.DictReader(file):
+                with contextlib.suppress(KeyError, TypeError, ValueError):  # the last may not be whole yet
+                    rows[int(row["epoch"])] = {name: float(row[name]) for name in LOGGED}
     return {name: [rows[episode][name] for episode in sorted(rows)] for name in LOGGED}
 
 

@@ -57,19 +57,19 @@ def episodes(
             epsilons.append(decay_epsilon(epsilons[-1], config))
         numbers = _numbers(env, agent, config, epsilons, min(at_once, config.num_episodes - first))
         played, *columns, fault = [x.numpy() for x in program(*map(tf.constant, numbers))]
-        facts = _Facts(*columns)
+        totals = _Totals(*columns)
         memory.rows[:] = rows.numpy()
         memory.num_appended = int(num_appended.numpy())
-        agent.num_updates += int(facts.updates.sum())
+        agent.num_updates += int(totals.updates.sum())
         agent.epsilon = decay_epsilon(epsilons[played - 1], config)
         if fault:
-            steps = facts.steps[played - 1]
+            steps = totals.steps[played - 1]
             raise (DivergedError if fault == _DIVERGED else ValueError)(
                 f"env {type(env).__name__}: {_FAULTS[fault]} was not finite in episode {first + played - 1}, "
                 + (f"step {steps - 1}" if steps else "at the reset")
             )
         agent.episodes += [
-            facts.episode(i, number, epsilon)
+            totals.episode(i, number, epsilon)
             for i, (number, epsilon) in enumerate(zip(range(first, first + played), epsilons, strict=False))
         ]
         seconds = time.perf_counter() - start
@@ -127,7 +127,7 @@ def _bind_program(
         rows, num_appended = variables
 
         def play(*numbers: tf.Tensor) -> tuple[tf.Tensor, ...]:
-            return _Program(env, spaces, config, formulas, learner, rows, num_appended, _Numbers(*numbers)).play()
+            return _Loop(env, spaces, config, formulas, learner, rows, num_appended, _Numbers(*numbers)).play()
 
         return play
 
@@ -160,7 +160,7 @@ _FAULTS = ("nothing", "an observation", "a reward", "the loss or a weight")
 _DIVERGED = 3
 
 
-class _Facts(NamedTuple):
+class _Totals(NamedTuple):
     """What comes out of the program: of one episode, or, with a leading axis, of several."""
 
     reward: Any  # float64
@@ -173,14 +173,14 @@ class _Facts(NamedTuple):
 
     def episode(self, i: int, number: int, epsilon: float) -> Episode:
         """The record of episode `i` of several."""
-        fact = _Facts(*(x[i].tolist() for x in self))
+        fact = _Totals(*(x[i].tolist() for x in self))
         loss, mean_q, td_error = (x / fact.updates if fact.updates else math.nan for x in fact.sums)
         max_q = fact.max_q if fact.updates else math.nan
         measures = (loss, mean_q, max_q, td_error, fact.max_reward)
         return Episode(number, fact.reward, fact.steps, epsilon, *measures, fact.terminated)
 
 
-class _Program:
+class _Loop:
     """The program itself, as it is traced."""
 
     def __init__(
@@ -198,46 +198,46 @@ class _Program:
         self._rows, self._num_appended, self._numbers = rows, num_appended, numbers
 
     def play(self) -> tuple[tf.Tensor, ...]:
-        """The program: -> episodes played, the _Facts of each, the fault."""
+        """The program: -> episodes played, the _Totals of each, the fault."""
         key, first, num_episodes, _, epsilons, recent, solved_reward, *_ = self._numbers
         window = recent.shape[0]
 
-        def is_to_go_on(i: tf.Tensor, facts: _Facts, fault: tf.Tensor) -> tf.Tensor:
+        def is_to_go_on(i: tf.Tensor, totals: _Totals, fault: tf.Tensor) -> tf.Tensor:
             # A little below the bound, so that `train`, which decides, is asked wherever rounding could matter.
-            may_be_solved = tf.reduce_mean(facts.reward[i : i + window]) > solved_reward - 1e-6
+            may_be_solved = tf.reduce_mean(totals.reward[i : i + window]) > solved_reward - 1e-6
             return (i < num_episodes) & (fault == 0) & ~((i > 0) & may_be_solved)
 
-        def play_one(i: tf.Tensor, facts: _Facts, _: tf.Tensor) -> tuple[tf.Tensor, _Facts, tf.Tensor]:
+        def play_one(i: tf.Tensor, totals: _Totals, _: tf.Tensor) -> tuple[tf.Tensor, _Totals, tf.Tensor]:
             new, fault = self._play_episode(episode_key(key, first + i), epsilons[i])
-            places = _Facts(*[i] * len(new))._replace(reward=i + window)
-            parts = zip(facts, places, new, strict=True)
-            return i + 1, _Facts(*(tf.tensor_scatter_nd_update(x, [[k]], [y]) for x, k, y in parts)), fault
+            places = _Totals(*[i] * len(new))._replace(reward=i + window)
+            parts = zip(totals, places, new, strict=True)
+            return i + 1, _Totals(*(tf.tensor_scatter_nd_update(x, [[k]], [y]) for x, k, y in parts)), fault
 
         integers, floats = tf.zeros([_CAPACITY], tf.int32), tf.zeros([_CAPACITY])
         rewards = tf.concat([recent, tf.zeros([_CAPACITY], tf.float64)], axis=0)
-        facts = _Facts(rewards, integers, tf.zeros([_CAPACITY, 3]), floats, floats, integers, integers > 0)
-        played, facts, fault = tf.while_loop(is_to_go_on, play_one, (tf.constant(0), facts, tf.constant(0)))
-        return played, *facts._replace(reward=facts.reward[window:]), fault
+        totals = _Totals(rewards, integers, tf.zeros([_CAPACITY, 3]), floats, floats, integers, integers > 0)
+        played, totals, fault = tf.while_loop(is_to_go_on, play_one, (tf.constant(0), totals, tf.constant(0)))
+        return played, *totals._replace(reward=totals.reward[window:]), fault
 
-    def _play_episode(self, key: tf.Tensor, epsilon: tf.Tensor) -> tuple[_Facts, tf.Tensor]:
+    def _play_episode(self, key: tf.Tensor, epsilon: tf.Tensor) -> tuple[_Totals, tf.Tensor]:
         """-> what it was like, and what was not finite in it, an index of _FAULTS."""
         rng = tf.stack([key, tf.constant(-(2**62), tf.int64)])
         state = self._env.initial(rng)
         observation = self._observation(state, rng)
         fault = tf.where(is_all_finite(observation), 0, 1)
         zero, least = tf.constant(0), tf.constant(-math.inf)
-        facts = _Facts(tf.constant(0, tf.float64), zero, tf.zeros([3]), least, least, zero, tf.constant(False))
-        start = ((state, observation), fault > 0, facts, fault)
+        totals = _Totals(tf.constant(0, tf.float64), zero, tf.zeros([3]), least, least, zero, tf.constant(False))
+        start = ((state, observation), fault > 0, totals, fault)
         turn = functools.partial(self._turn, key, epsilon)
-        _, _, facts, fault = tf.while_loop(lambda state, is_over, *_: ~is_over, turn, start)
-        return facts, fault
+        _, _, totals, fault = tf.while_loop(lambda state, is_over, *_: ~is_over, turn, start)
+        return totals, fault
 
     def _turn(
-        self, key: tf.Tensor, epsilon: tf.Tensor, state: Any, is_over: tf.Tensor, facts: _Facts, fault: tf.Tensor
+        self, key: tf.Tensor, epsilon: tf.Tensor, state: Any, is_over: tf.Tensor, totals: _Totals, fault: tf.Tensor
     ) -> tuple[Any, ...]:
-        """The env steps up to the next update, and the update: -> state, is_over, facts, fault."""
+        """The env steps up to the next update, and the update: -> state, is_over, totals, fault."""
         n, batch_size, memory_size = self._config.steps_per_update, self._config.batch_size, self._config.memory_size
-        number = (facts.steps + n - 1) // n  # turn 0 is step 0, turn k the n steps up to step k n
+        number = (totals.steps + n - 1) // n  # turn 0 is step 0, turn k the n steps up to step k n
         bits = draw_bits(2 * n + batch_size, key, number)
 
         def step(
@@ -250,7 +250,7 @@ class _Program:
             reward, most = reward + tf.cast(new_reward, tf.float64), tf.maximum(most, new_reward)
             return state, is_over, reward, most, t + 1, t % n == 0, terminated, fault
 
-        start = (state, is_over, facts.reward, facts.max_reward, facts.steps, False, facts.terminated, fault)
+        start = (state, is_over, totals.reward, totals.max_reward, totals.steps, False, totals.terminated, fault)
         state, is_over, reward, max_reward, steps, is_update, terminated, fault = tf.while_loop(
             lambda state, is_over, reward, most, t, is_update, *_: ~is_over & ~is_update,
             step,
@@ -265,16 +265,16 @@ class _Program:
             lambda: _NO_UPDATE,
         )
         fault = tf.where(tf.math.is_finite(loss), fault, _DIVERGED)
-        facts = _Facts(
+        totals = _Totals(
             reward,
             steps,
-            facts.sums + tf.stack([loss, mean_q, td_error]),
-            tf.maximum(facts.max_q, max_q),
+            totals.sums + tf.stack([loss, mean_q, td_error]),
+            tf.maximum(totals.max_q, max_q),
             max_reward,
-            facts.updates + tf.cast(is_update, tf.int32),
+            totals.updates + tf.cast(is_update, tf.int32),
             terminated,
         )
-        return state, is_over | (fault > 0), facts, fault
+        return state, is_over | (fault > 0), totals, fault
 
     def _step(
         self, state: Any, epsilon: tf.Tensor, bits: tf.Tensor, action_bits: tf.Tensor, rng: tf.Tensor

@@ -14,7 +14,7 @@ import numpy as np
 
 from dqn_keras.version import __version__
 
-FORMAT = 4
+FORMAT = 5
 
 
 class DamagedError(ValueError):
