@@ -23,7 +23,7 @@ from .replay import ReplayMemory as ReplayMemory
 from .seeding import episode_seed as episode_seed
 from .statistics import compare as compare
 from .statistics import summarize as summarize
-from .storage.networks import load_agent as load_agent
+from .storage.networks import load_q_network as load_q_network
 from .study import Study as Study
 from .study import load_study as load_study
 from .study import study as study

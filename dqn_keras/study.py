@@ -32,7 +32,9 @@ from dqn_keras.checks.run import check_arguments
 from dqn_keras.config import Config
 from dqn_keras.progress import tqdm
 from dqn_keras.storage.files import FORMAT, from_bytes, replacing, to_bytes
-from dqn_keras.storage.identity import check_is_same, describe, identity_of_study, warn_of_other_versions
+from dqn_keras.storage.identity import check_is_same, identity_of_study
+from dqn_keras.storage.parts import describe
+from dqn_keras.storage.versions import warn_of_other_versions
 from dqn_keras.training import train
 
 

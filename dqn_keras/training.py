@@ -29,7 +29,7 @@ from dqn_keras.progress import Progress
 from dqn_keras.seeding import checked_seed
 from dqn_keras.storage.checkpoint import Checkpoints
 from dqn_keras.storage.identity import identity
-from dqn_keras.storage.networks import save_agent
+from dqn_keras.storage.networks import save_q_network
 
 
 @dataclasses.dataclass(repr=False)
@@ -82,8 +82,8 @@ class Run:
         return self.agent.q_hat_network
 
     def save(self, path: str | os.PathLike) -> None:
-        """Save the network that acts, alone, as a .keras file; `load_agent`, or Keras anywhere, loads it."""
-        save_agent(path, self.q_network)
+        """Save the network that acts, alone, as a .keras file; `load_q_network`, or Keras anywhere, loads it."""
+        save_q_network(path, self.q_network)
 
     def __repr__(self) -> str:
         outcome = "not solved" if self.solved_at is None else f"solved_at={self.solved_at}"

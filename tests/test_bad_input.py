@@ -5,7 +5,17 @@ import keras
 import numpy as np
 import pytest
 
-from dqn_keras import Config, ReplayMemory, action, evaluate, learn, load_agent, make_networks, make_q_network, train
+from dqn_keras import (
+    Config,
+    ReplayMemory,
+    action,
+    evaluate,
+    learn,
+    load_q_network,
+    make_networks,
+    make_q_network,
+    train,
+)
 from dqn_keras.checks.numbers import check_counts
 from dqn_keras.environments import CartPole
 from tests.helpers.environments import Corridor, OldReset, OldStep
@@ -130,7 +140,7 @@ OTHERS = {
     "Q-values of two states": (lambda: action(np.zeros((2, 2)), 0.1, np.random.default_rng(0)), "q_values must be"),
     "a memory of no transitions": (lambda: ReplayMemory(0, (4,)), "memory_size must be"),
     "no hidden layer": (lambda: check_counts("hidden_units", []), "hidden_units must hold"),
-    "a file that is no network": (lambda: load_agent(__file__), "path .* is not a network"),
+    "a file that is no network": (lambda: load_q_network(__file__), "path .* is not a network"),
 }
 
 

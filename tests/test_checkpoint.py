@@ -15,13 +15,13 @@ import keras
 import numpy as np
 import pytest
 
-from dqn_keras import Config, evaluate, load_agent, make_networks, train
+from dqn_keras import Config, evaluate, load_q_network, make_networks, train
 from dqn_keras.agent import make_agent
 from dqn_keras.environments import CartPole
 from dqn_keras.storage.checkpoint import Checkpoints
 from dqn_keras.storage.files import from_bytes, to_bytes
 from dqn_keras.storage.identity import identity
-from dqn_keras.storage.networks import save_agent
+from dqn_keras.storage.networks import save_q_network
 from tests.helpers import faults
 from tests.helpers.environments import Corridor
 from tests.helpers.faults import CONFIG, LOOPS, SEED, final_bits, newest, play
@@ -412,11 +412,11 @@ def test_a_saved_network_plays_the_same_and_is_only_a_network(tmp_path, cartpole
     run.save(path)
     run.save(path)
     assert [p.name for p in path.parent.iterdir()] == ["agent.keras"]
-    for network in (load_agent(path), keras.saving.load_model(path)):
+    for network in (load_q_network(path), keras.saving.load_model(path)):
         for ours, theirs in zip(network.get_weights(), run.q_network.get_weights(), strict=True):
             np.testing.assert_array_equal(ours, theirs)
         assert getattr(network, "optimizer", None) is None
-    returns = [evaluate(cartpole, n, num_episodes=3, seed=0) for n in (load_agent(path), run.q_network)]
+    returns = [evaluate(cartpole, n, num_episodes=3, seed=0) for n in (load_q_network(path), run.q_network)]
     np.testing.assert_array_equal(*returns)
     with pytest.raises(ValueError, match=r"^path must end in \.keras, got 'agent\.h5'"):
         run.save("agent.h5")
@@ -425,9 +425,9 @@ def test_a_saved_network_plays_the_same_and_is_only_a_network(tmp_path, cartpole
 def test_a_network_that_cannot_be_trusted_is_not_loaded(tmp_path):
     path = tmp_path / "agent.keras"
     with pytest.raises(FileNotFoundError, match=r"agent\.keras"):
-        load_agent(path)
+        load_q_network(path)
     network, _ = make_networks(4, 2, seed=0)
-    save_agent(path, network)
+    save_q_network(path, network)
     good, silent = path.read_bytes(), 0
     rng = np.random.default_rng(0)
     for _ in range(100):
@@ -435,17 +435,17 @@ def test_a_network_that_cannot_be_trusted_is_not_loaded(tmp_path):
         spoilt[rng.integers(len(good))] ^= 1 << rng.integers(8)
         path.write_bytes(spoilt)
         with contextlib.suppress(ValueError):  # a flip may also be in what is not the network, such as a date
-            loaded = load_agent(path).get_weights()
+            loaded = load_q_network(path).get_weights()
             silent += any((a != b).any() for a, b in zip(loaded, network.get_weights(), strict=True))
     assert silent == 0
     network.set_weights([np.full_like(w, np.nan) for w in network.get_weights()])
-    save_agent(path, network)
+    save_q_network(path, network)
     with pytest.raises(ValueError, match=r"agent\.keras is not a network that can be loaded: .*not finite"):
-        load_agent(path)
+        load_q_network(path)
     unsafe = keras.Sequential([keras.Input((4,)), keras.layers.Lambda(lambda x: x)])
     unsafe.save(path)
     with pytest.raises(ValueError, match=r"agent\.keras is not a network that can be loaded"):
-        load_agent(path)
+        load_q_network(path)
 
 
 def test_nothing_is_restored_from_a_checkpoint_that_is_not_there(tmp_path):

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dqn_keras import Config, evaluate, load_agent, load_study, train
+from dqn_keras import Config, evaluate, load_q_network, load_study, train
 from dqn_keras.cli.options import main
 from dqn_keras.environments import CartPole
 
@@ -73,7 +73,7 @@ def test_a_run_folder_holds_what_one_expects():
     config = Config(tau=0.005, hidden_units=(8, 4), num_episodes=12, batch_size=16, solved_reward=1000)
     run = train(gym.make("CartPole-v1"), config, seed=3, verbose=0)
     assert [float(row["reward"]) for row in log("runs/a")] == run.rewards.tolist()
-    for kept, ours in zip(load_agent("runs/a/agent.keras").get_weights(), run.q_network.get_weights(), strict=True):
+    for kept, ours in zip(load_q_network("runs/a/agent.keras").get_weights(), run.q_network.get_weights(), strict=True):
         np.testing.assert_array_equal(kept, ours)
     with Image.open("runs/a/curve.png") as picture:
         assert picture.width > 1000
@@ -90,7 +90,7 @@ def test_compiled_episodes_are_those_of_the_functional_twin():
 def test_the_agent_is_evaluated_and_watched(capsys):
     dqn_keras(f"train CartPole-v1 --seed 0 --out a {SHORT}")
     assert dqn_keras("evaluate a --episodes 5 --seed 1") == 0
-    returns = evaluate(gym.make("CartPole-v1"), load_agent("a/agent.keras"), 5, seed=1)
+    returns = evaluate(gym.make("CartPole-v1"), load_q_network("a/agent.keras"), 5, seed=1)
     assert capsys.readouterr().out.startswith(
         f"5 greedy episodes: mean return {returns.mean():.1f}, standard deviation"
     )
@@ -129,7 +129,7 @@ def test_a_real_window_opens(capsys):
 def test_environments_take_arguments_and_wrappers(tmp_path):
     line = f"train FrozenLake-v1 --flatten --env-args is_slippery=False map_name=8x8 --seed 0 --out a {SHORT}"
     assert dqn_keras(line) == 0
-    assert load_agent("a/agent.keras").input_shape == (None, 64)
+    assert load_q_network("a/agent.keras").input_shape == (None, 64)
     assert dqn_keras("evaluate a --episodes 2") == 0
     Path("my_environments.py").write_text(
         "import gymnasium as gym\nfrom tests.helpers.environments import Corridor\n"
@@ -160,7 +160,7 @@ def test_a_longer_run_is_the_run_that_had_been_longer_from_the_start():
 def differing(*folders):
     """In what the results of two runs differ; the speeds may."""
     logs = [[{k: v for k, v in row.items() if k != "steps_per_second"} for row in log(folder)] for folder in folders]
-    weights = [load_agent(Path(folder, "agent.keras")).get_weights() for folder in folders]
+    weights = [load_q_network(Path(folder, "agent.keras")).get_weights() for folder in folders]
     return [
         name
         for name, same in (

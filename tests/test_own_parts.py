@@ -10,7 +10,7 @@ import tensorflow as tf
 from gymnasium.experimental.functional import FuncEnv
 from gymnasium.wrappers import FlattenObservation, TimeLimit
 
-from dqn_keras import Config, Experience, ReplayMemory, evaluate, load_agent, make_networks, train
+from dqn_keras import Config, Experience, ReplayMemory, evaluate, load_q_network, make_networks, train
 from dqn_keras.environments import CartPole
 from dqn_keras.replay import pack, unpack
 from tests.helpers.environments import Corridor
@@ -209,7 +209,7 @@ def test_a_run_with_a_network_of_the_readers_own_is_saved_and_gone_on_from(tmp_p
     np.testing.assert_array_equal(weights(run), weights(whole))
     np.testing.assert_array_equal(run.agent.memory.rows, whole.agent.memory.rows)
     run.save(tmp_path / "agent.keras")
-    assert evaluate(Beacon(), load_agent(tmp_path / "agent.keras"), 2, seed=1).tolist() == (
+    assert evaluate(Beacon(), load_q_network(tmp_path / "agent.keras"), 2, seed=1).tolist() == (
         evaluate(Beacon(), run.q_network, 2, seed=1).tolist()
     )
     other = keras.Sequential([keras.Input((6, 6, 1)), keras.layers.Flatten(), keras.layers.Dense(3)])

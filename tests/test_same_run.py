@@ -320,7 +320,7 @@ def test_what_was_saved_by_another_version_is_compared_by_its_source(tmp_path, m
     monkeypatch.setattr(importlib.import_module(__name__), "FACTOR", 1.5)  # which the source does not show
     with pytest.warns(UserWarning, match="was saved with keras"):
         go_on(tmp_path, loss=scaled_loss)
-    monkeypatch.setattr(identity.inspect, "getsource", lambda code: "another")
+    monkeypatch.setattr(importlib.import_module("dqn_keras.storage.parts").inspect, "getsource", lambda code: "another")
     with pytest.raises(ValueError, match=r"^loss is .*scaled_loss' in .*, got one of that name with another source$"):
         go_on(tmp_path, loss=scaled_loss)
 

@@ -39,7 +39,7 @@ def resume(options: "cli.Resume") -> int:
 
 def watch(options: "cli.Watch") -> int:
     """Play in a window, or into a GIF."""
-    settings, network = run_folder.read_settings(options.folder), run_folder.read_agent(options.folder)
+    settings, network = run_folder.read_settings(options.folder), run_folder.read_q_network(options.folder)
     max_steps = settings.config.max_steps
     if _has_display() and not options.gif:
         with contextlib.closing(settings.env.make(render_mode="human")) as env:
@@ -57,7 +57,7 @@ def watch(options: "cli.Watch") -> int:
 
 def evaluate(options: "cli.Evaluate") -> int:
     """Play greedily."""
-    settings, network = run_folder.read_settings(options.folder), run_folder.read_agent(options.folder)
+    settings, network = run_folder.read_settings(options.folder), run_folder.read_q_network(options.folder)
     with contextlib.closing(settings.env.make()) as env:
         _print_returns(play_greedily(env, network, options.episodes, options.seed, settings.config.max_steps))
     return 0

@@ -21,8 +21,8 @@ from dqn_keras.config import Config
 from dqn_keras.metrics import LOGGED
 from dqn_keras.plotting import plot_history, plot_study
 from dqn_keras.storage.files import replacing
-from dqn_keras.storage.identity import versions
-from dqn_keras.storage.networks import load_agent
+from dqn_keras.storage.networks import load_q_network
+from dqn_keras.storage.versions import versions
 from dqn_keras.study import load_study
 from dqn_keras.training import Run, train
 
@@ -114,13 +114,13 @@ def read_settings(folder: Path) -> Settings:
         raise ValueError(f"{path} is not as `dqn-keras train` writes it: {error}") from None
 
 
-def read_agent(folder: Path) -> keras.Model:
+def read_q_network(folder: Path) -> keras.Model:
     """The network of a run that has ended."""
     if not (folder / "agent.keras").exists():
         raise FileNotFoundError(
             f"{folder} has no agent.keras: its run is going on, or was killed, and dqn-keras resume {folder} goes on"
         )
-    return load_agent(folder / "agent.keras")
+    return load_q_network(folder / "agent.keras")
 
 
 def begin(folder: Path, settings: Settings, verbose: int) -> Run:

@@ -19,7 +19,8 @@ from dqn_keras.learn import Metrics
 from dqn_keras.metrics import Episode
 from dqn_keras.replay import unpack
 from dqn_keras.storage.files import FORMAT, DamagedError, from_bytes, replacing, to_bytes
-from dqn_keras.storage.identity import Identity, check_is_same, warn_of_other_versions
+from dqn_keras.storage.identity import Identity, check_is_same
+from dqn_keras.storage.versions import warn_of_other_versions
 
 
 class Checkpoints:

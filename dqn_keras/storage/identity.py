@@ -1,45 +1,23 @@
 """What makes two runs the same run, in words and numbers that a file can hold."""
 
 import dataclasses
-import functools
-import hashlib
-import inspect
 import json
-import operator
-import platform
-import re
-import sys
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FunctionType, MethodType
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 
-from dqn_keras._engine.graphs import Computation, computation
-from dqn_keras._engine.libraries import is_of_a_library
-from dqn_keras._engine.private import all_layers
+from dqn_keras._engine.graphs import computation
 from dqn_keras._engine.tensorflow import keras, tf
 from dqn_keras.agent import Agent
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
 from dqn_keras.learn import DEFAULT_FORMULAS, packages
 from dqn_keras.replay import Experience
-from dqn_keras.version import __version__
-
-
-class Part(NamedTuple):
-    """One part of a run: the network, the optimizer, a formula or the environment."""
-
-    words: Any
-    """What it is called, with its settings as far as they have names."""
-    source: str = ""
-    """A digest of the source of the user's code in it."""
-    computes: str = ""
-    """A digest of the graph that it is traced to, where it has one: it tells apart all that computes something else."""
+from dqn_keras.storage.parts import Part, check_can_be_imported, describe, source_of, words_for
+from dqn_keras.storage.versions import versions
 
 
 class Identity(NamedTuple):
@@ -81,16 +59,16 @@ def identity(
     if not packages(formulas):
         given |= formulas._asdict()
     for name, part in given.items():
-        _check_can_be_imported(name, part)
+        check_can_be_imported(name, part)
     environment, *computations = describe(env)
     parts = {"env": environment}
     for name, (function, specs) in _traceable(agent, config, formulas).items():
         part = given.get(name, formulas._asdict().get(name))
         if (part is not None and name in given) or (name == "optimizer" and q_network is not None):
             computations.append(computation(function, specs, agent.learner.variables))
-            parts[name] = Part(_words(part), _source(part), computations[-1].digest)
+            parts[name] = Part(words_for(part), source_of(part), computations[-1].digest)
         else:
-            parts[name] = Part(_words(part))
+            parts[name] = Part(words_for(part))
     others = {id(variable): variable for x in computations for variable in x.other_variables}
     return Identity(_facts(config, **parts), list(others.values()))
 
@@ -156,189 +134,3 @@ def check_is_same(path: Path, theirs: dict[str, Any], ours: dict[str, Any], but_
                 )
         elif saved.source != here.source:
             raise ValueError(f"{name} is {saved.words!r} in {path}, got one of that name with another source")
-
-
-def warn_of_other_versions(path: Path, theirs: dict[str, Any], ours: dict[str, Any], stacklevel: int) -> None:
-    """One warning of all versions that differ."""
-    theirs, ours = theirs["versions"], ours["versions"]
-    others = [f"{name} {theirs.get(name)} (here {ours[name]})" for name in ours if theirs.get(name) != ours[name]]
-    if others:
-        warnings.warn(
-            f"{path} was saved with {', '.join(others)}: what is added may differ in its last bits",
-            stacklevel=stacklevel,
-        )
-
-
-def _words(part: Any) -> str:
-    """What a network, an optimizer or a formula is called, with the settings that were chosen."""
-    if part is None:
-        return "the default"
-    if isinstance(part, str):
-        return part
-    if isinstance(part, keras.Model):
-        layers = ", ".join(type(layer).__name__ for layer in part.layers)
-        return f"{layers} ({part.count_params()} weights)"
-    if isinstance(part, functools.partial):
-        return f"partial of {_words(part.func)}"
-    if hasattr(part, "__qualname__"):
-        return f"{part.__module__}.{part.__qualname__}"
-    settings = _chosen_settings(part)
-    if isinstance(rate := getattr(part, "learning_rate", None), keras.Variable):
-        settings["learning_rate"] = f"{float(rate):.6g}"
-    return f"{type(part).__module__}.{type(part).__qualname__}({', '.join(f'{k}={x}' for k, x in settings.items())})"
-
-
-def _chosen_settings(part: Any) -> dict[str, Any]:
-    """Those of a Keras object's configuration that are not as by default, as far as it has one."""
-    try:
-        config, usual = part.get_config(), type(part)().get_config()
-    except Exception:  # whatever a class of the user's says
-        return {}
-    chosen = {name: x for name, x in config.items() if name != "name" and x != usual.get(name)}
-    return {name: x["class_name"] if isinstance(x, dict) and "class_name" in x else x for name, x in chosen.items()}
-
-
-def _source(part: Any) -> str:
-    """A digest of the source of the user's functions and classes that a part is made of."""
-    sources = []
-    for code in _own_code(part, set()):
-        try:
-            sources.append(inspect.getsource(code))
-        except (OSError, TypeError):  # typed in where no source is kept
-            sources.append(code.__qualname__)
-    return hashlib.sha256("".join(sources).encode()).hexdigest()[:12] if sources else ""
-
-
-def _check_can_be_imported(argument: str, part: Any) -> None:
-    """ValueError if a function or class of the user's has no name that says what it is."""
-    for code in _own_code(part, set()):
-        try:
-            is_importable = operator.attrgetter(code.__qualname__)(sys.modules[code.__module__]) is code
-        except (AttributeError, KeyError):
-            is_importable = False
-        if not is_importable:
-            raise ValueError(
-                f"{argument} must have a name that can be imported, since the checkpoint keeps it; "
-                f"{code.__module__}.{code.__qualname__} has none: "
-                "define it with `def` or `class` at the top level of a module, a script or a notebook"
-            )
-
-
-def _own_code(part: Any, met: set[int]) -> Iterator[Any]:
-    """The user's functions and classes that a part is made of: itself, its class, and what its attributes hold."""
-    if id(part) in met:
-        return
-    met.add(id(part))
-    held: list[Any] = []
-    if isinstance(part, FunctionType | type):
-        if not is_of_a_library(part):
-            yield part
-    elif isinstance(part, functools.partial):
-        held = [part.func, *part.args, *part.keywords.values()]
-    elif isinstance(part, MethodType):
-        held = [part.__func__, part.__self__]
-    elif isinstance(part, keras.Model):
-        held = all_layers(part)
-    elif isinstance(part, list | tuple):
-        held = list(part)
-    elif isinstance(part, dict):
-        held = list(part.values())
-    elif hasattr(part, "python_function"):  # a tf.function
-        held = [part.python_function]
-    elif hasattr(part, "__dict__") and not isinstance(part, keras.Variable):
-        of_keras = is_of_a_library(type(part))  # whose other attributes are its books
-        held = [type(part), *(x for x in vars(part).values() if not of_keras or isinstance(x, _MAY_BE_OWN))]
-    for x in held:
-        yield from _own_code(x, met)
-
-
-_MAY_BE_OWN = (
-    FunctionType,
-    functools.partial,
-    MethodType,
-    keras.Optimizer,
-    keras.optimizers.schedules.LearningRateSchedule,
-    keras.losses.Loss,
-    keras.regularizers.Regularizer,
-    keras.constraints.Constraint,
-)
-
-
-def describe(env: gym.Env | FuncEnv) -> tuple[Part, *tuple[Computation, ...]]:
-    """What makes it this environment, as far as can be seen; `render_mode` does not.
-
-    Of a registered one its id and arguments, of any other the constructor's arguments that it keeps under their names;
-    of a functional one also what it computes.
-    """
-    wrappers: list[Any] = []
-    if isinstance(env, FuncEnv):
-        name, arguments = f"{type(env).__name__} (functional)", vars(env)
-    else:
-        wrapper = env
-        while isinstance(wrapper, gym.Wrapper):
-            wrappers.append(type(wrapper).__name__)
-            wrapper = wrapper.env
-        if env.spec:
-            wrappers += [[w.name, _plain(w.kwargs)] for w in env.spec.additional_wrappers]
-            name, arguments = env.spec.id, {**env.spec.kwargs, "max_episode_steps": env.spec.max_episode_steps}
-        else:
-            parameters = inspect.signature(type(env.unwrapped).__init__).parameters
-            kept = vars(env.unwrapped)
-            name, arguments = type(env.unwrapped).__name__, {k: kept[k] for k in parameters if k in kept}
-    words = {
-        "name": name,
-        "arguments": _plain({key: value for key, value in sorted(arguments.items()) if key != "render_mode"}),
-        "wrappers": wrappers,
-        "observation_space": str(env.observation_space),
-        "action_space": str(env.action_space),
-    }
-    if not isinstance(env, FuncEnv):
-        return (Part(words),)
-
-    def play(rng: tf.Tensor, action: tf.Tensor) -> list[Any]:
-        state = env.initial(rng)
-        next_state = env.transition(state, action, rng)
-        reward, terminal = env.reward(state, action, next_state, rng), env.terminal(next_state, rng)
-        return [state, env.observation(state, rng), next_state, reward, terminal]
-
-    computes = computation(play, [tf.TensorSpec((2,), tf.int64), tf.TensorSpec((), tf.int32)])
-    return Part(words, _source(type(env)), computes.digest), computes
-
-
-def _plain(value: Any, depth: int = 3) -> Any:
-    """Something that JSON holds, equal for equal values; of what has no plain value, its type."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, dict):
-        return {str(key): _plain(x, depth) for key, x in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(x, depth) for x in value]
-    if isinstance(value, set | frozenset):  # whose order differs from process to process
-        return sorted((_plain(x, depth) for x in value), key=repr)
-    if isinstance(value, functools.partial):
-        return [_plain(value.func, depth), _plain(value.args, depth), _plain(value.keywords, depth)]
-    if tf.is_tensor(value) or isinstance(value, np.ndarray):
-        array = np.asarray(value)
-        return [str(array.dtype), list(array.shape), hashlib.sha256(array.tobytes()).hexdigest()]
-    if not hasattr(value, "__qualname__") and not is_of_a_library(type(value)) and depth:
-        return [type(value).__qualname__, _plain(getattr(value, "__dict__", {}), depth - 1)]
-    return getattr(value, "__qualname__", type(value).__qualname__)
-
-
-def versions() -> dict[str, str]:
-    """What the last bits of a result may depend on."""
-    modules = {"tensorflow": tf, "keras": keras, "numpy": np, "gymnasium": gym}
-    versions = {name: module.__version__ for name, module in modules.items()}
-    return {"dqn_keras": __version__, "python": platform.python_version(), **versions, "processor": _processor()}
-
-
-def _processor() -> str:
-    """Its kind, with the vector instructions where the system tells them."""
-    try:
-        flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        flags = None
-    vector = sorted(x for x in flags[1].split() if x.startswith(("sse4", "avx", "fma", "amx"))) if flags else []
-    return " ".join([platform.machine(), *vector])

@@ -12,7 +12,7 @@ from dqn_keras.checks.networks import check_network
 from dqn_keras.storage.files import replacing
 
 
-def save_agent(path: str | os.PathLike, q_network: keras.Model) -> None:
+def save_q_network(path: str | os.PathLike, q_network: keras.Model) -> None:
     """Save the network alone, in Keras' own format; an older file of that name is replaced at once.
 
     Raises:
@@ -38,7 +38,7 @@ def save_agent(path: str | os.PathLike, q_network: keras.Model) -> None:
         network.save(temporary)
 
 
-def load_agent(path: str | os.PathLike) -> keras.Model:
+def load_q_network(path: str | os.PathLike) -> keras.Model:
     """The network that `run.save` saved, for `evaluate`, or whatever a Keras model is good for.
 
     It is Keras' own format, in Keras' safe mode: a file that would run code of its own is refused.

@@ -1,0 +1,41 @@
+"""The versions and the processor that a result was made with."""
+
+import platform
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from dqn_keras._engine.tensorflow import keras, tf
+from dqn_keras.version import __version__
+
+
+def versions() -> dict[str, str]:
+    """What the last bits of a result may depend on."""
+    modules = {"tensorflow": tf, "keras": keras, "numpy": np, "gymnasium": gym}
+    versions = {name: module.__version__ for name, module in modules.items()}
+    return {"dqn_keras": __version__, "python": platform.python_version(), **versions, "processor": _processor()}
+
+
+def _processor() -> str:
+    """Its kind, with the vector instructions where the system tells them."""
+    try:
+        flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        flags = None
+    vector = sorted(x for x in flags[1].split() if x.startswith(("sse4", "avx", "fma", "amx"))) if flags else []
+    return " ".join([platform.machine(), *vector])
+
+
+def warn_of_other_versions(path: Path, theirs: dict[str, Any], ours: dict[str, Any], stacklevel: int) -> None:
+    """One warning of all versions that differ."""
+    theirs, ours = theirs["versions"], ours["versions"]
+    others = [f"{name} {theirs.get(name)} (here {ours[name]})" for name in ours if theirs.get(name) != ours[name]]
+    if others:
+        warnings.warn(
+            f"{path} was saved with {', '.join(others)}: what is added may differ in its last bits",
+            stacklevel=stacklevel,
+        )
