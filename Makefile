@@ -1,8 +1,16 @@
-# make notebook: run the notebook end to end.  make test: lint, types, tests and notebooks.  make docs: the site.
+# make notebook: run the notebooks end to end.  make test: lint, types, tests and notebooks.  make docs: the site.
+# make test-lowest: the fast tests with the lowest versions that pyproject.toml allows, and on newer Pythons.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: notebook test lint format docs docs-serve clean
+.PHONY: notebook test test-lowest lint format docs docs-serve clean
+
+# $(call install,PYTHON,ENVIRONMENT,CONSTRAINTS,EXTRA)
+define install
+$(1) -m venv $(2)
+$(2)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(3) --editable ".[$(4)]"
+touch $(2)/installed
+endef
 
 notebook: .venv/installed
 	$(BIN)/python notebooks/render.py
@@ -32,9 +40,23 @@ docs-serve: .venv/docs-installed
 	touch $@
 
 .venv/installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
-	touch $@
+	$(call install,$(PYTHON),.venv,constraints.txt,dev)
+
+# Newer Pythons, where they are installed.
+NEWER := $(shell for version in 3.12 3.13; do python$$version -c "" 2>/dev/null && echo $$version; done)
+
+.PRECIOUS: .venv-%/installed
+
+test-lowest: $(addprefix test-on-,lowest $(NEWER))
+
+test-on-%: .venv-%/installed
+	.venv-$*/bin/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile tests
+
+.venv-lowest/installed: pyproject.toml constraints-lowest.txt
+	$(call install,$(PYTHON),.venv-lowest,constraints-lowest.txt,test)
+
+.venv-%/installed: pyproject.toml constraints.txt
+	$(call install,python$*,.venv-$*,constraints.txt,test)
 
 clean:
-	rm -rf .venv build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-* build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

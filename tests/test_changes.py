@@ -48,6 +48,16 @@ def check_is_seen(learning, change, **own):
     assert not all(map(np.array_equal, before, learning(**own)))
 
 
+def test_an_item_that_changes_in_an_attribute_of_a_keras_layer_is_seen(random_batch):
+    scale = keras.layers.Lambda(lambda x, factor: factor * x, arguments={"factor": 1.0}, output_shape=(2,))
+    q_network = keras.Sequential([keras.Input((4,)), keras.layers.Dense(2), scale])
+    q_hat_network = keras.Sequential([keras.Input((4,)), keras.layers.Dense(2)])
+    optimizer, batch = keras.optimizers.SGD(0.0), random_batch(8)
+    losses = [float(learn(batch, 0.9, q_network, q_hat_network, optimizer, tau=0.0)) for _ in range(2)]
+    scale.arguments["factor"] = 3.0
+    assert losses[0] == losses[1] != float(learn(batch, 0.9, q_network, q_hat_network, optimizer, tau=0.0))
+
+
 class Slotted:
     __slots__ = ("factor",)
 

@@ -1,6 +1,9 @@
 import os
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -59,3 +62,12 @@ def test_another_keras_backend_is_refused():
         [sys.executable, "-c", "from dqn_keras import learn"], env=environment, capture_output=True, text=True
     )
     assert "ImportError: dqn_keras needs Keras on TensorFlow, not on 'jax'" in done.stderr
+
+
+def test_the_lowest_versions_that_are_tested_are_the_lowest_that_are_allowed():
+    root = Path(__file__).parent.parent
+    pinned = dict(line.lower().split("==") for line in (root / "constraints-lowest.txt").read_text().split())
+    for requirement in tomllib.loads((root / "pyproject.toml").read_text())["project"]["dependencies"]:
+        name, lowest = re.match(r"(\w+)(?:\[.*\])? >=([\d.]+)", requirement).groups()
+        version = pinned[name.replace("_", "-")]
+        assert version == lowest or re.fullmatch(rf"{re.escape(lowest)}(\.0)+", version), requirement

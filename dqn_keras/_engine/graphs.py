@@ -1,4 +1,4 @@
-"""What a traced function computes, apart from the names in it."""
+"""Digests of what a traced function computes, independent of the names in it."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
@@ -9,18 +9,18 @@ from dqn_keras._engine.tensorflow import tf
 
 
 class Computation(NamedTuple):
-    """What a function does, as another process can tell it again."""
+    """What a function computes, in a form that another process can compare."""
 
     digest: str
-    """Equal for functions that compute the same from the same; empty if the function calls Python, which is unseen."""
+    """Digest, equal for functions that compute the same; empty if the function calls Python, which no graph shows."""
     other_variables: list[tf.Variable]
-    """The variables that it reads or changes beside those it is known to."""
+    """Variables that the function reads or changes, other than those given to `computation`."""
 
 
 def computation(
     function: Callable, specs: Sequence[tf.TensorSpec], variables: Sequence[tf.Variable] = ()
 ) -> Computation:
-    """Traces `function` of tensors as in `specs`, which may use `variables`."""
+    """Returns what `function` computes from tensors as in `specs`; `variables` are those that it may use."""
     concrete = traced(function, specs)
     numbers: dict[int, Any] = {id(handle(x)): (i, tuple(x.shape)) for i, x in enumerate(variables)}
     others = [x for x in concrete.variables if id(x.handle) not in numbers]
@@ -35,17 +35,17 @@ def computation(
 
 
 def fingerprint(concrete: Any) -> str:
-    """A digest of a ConcreteFunction: its graph, constants and inner functions included, but no names.
+    """Returns a digest of a ConcreteFunction: of its graph, constants and inner functions, without names.
 
-    TensorFlow numbers the names of nodes and functions through a process, and Keras those of layers, so that the same
-    code traced twice gives graphs that differ in names alone. Two functions of one fingerprint compute the same.
+    TensorFlow numbers nodes and functions across a process, and Keras numbers layers. The same code traced twice
+    therefore gives graphs that differ only in names. Two functions with the same fingerprint compute the same.
     """
     first, *others = _functions(concrete)
     library = {function.signature.name: function for function in others}
     functions = [first]
-    numbers: dict[str, int] = {}  # of the inner functions, in the order in which they are met
+    numbers: dict[str, int] = {}  # of the inner functions, in the order of first use
     digest = hashlib.sha256()
-    for function in functions:  # which grows on the way
+    for function in functions:  # the list grows inside the loop
         for part in _parts(function, numbers):
             digest.update(repr(part).encode())
         functions += [library[name] for name in list(numbers)[len(functions) - 1 :]]
@@ -53,12 +53,12 @@ def fingerprint(concrete: Any) -> str:
 
 
 def _functions(concrete: Any) -> list[Any]:
-    """The function as a FunctionDef, and those that it may call."""
+    """Returns the FunctionDefs of the function and of all functions that it may call."""
     return [concrete.function_def, *concrete.graph.as_graph_def().library.function]
 
 
 def _parts(function: Any, numbers: dict[str, int]) -> Iterator[Any]:
-    """All that a FunctionDef says, its arguments and nodes numbered."""
+    """Yields the contents of a FunctionDef, with numbers in place of the names of arguments and nodes."""
     names = {x.name: i for i, x in enumerate([*function.signature.input_arg, *function.node_def])}
 
     def reference(text: str) -> Any:  # "NAME", "NAME:OUTPUT:INDEX", or "^NAME"
@@ -84,5 +84,5 @@ def _attributes(attributes: Any, numbers: dict[str, int]) -> Iterator[Any]:
                 name,
                 [(numbers.setdefault(f.name, len(numbers)), list(_attributes(f.attr, numbers))) for f in functions],
             )
-        elif name not in ("_gradient_op_type", "_class"):  # the names of the op's gradient, and of its neighbours
+        elif name not in ("_gradient_op_type", "_class"):  # the names of the op's gradient, and of ops beside it
             yield name, value.SerializeToString(deterministic=True)

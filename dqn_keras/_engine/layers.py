@@ -1,4 +1,4 @@
-"""Layers of the package's own that XLA compiles into faster code."""
+"""Layers that XLA compiles into faster code than Keras' own."""
 
 from collections.abc import Callable
 
@@ -6,10 +6,10 @@ from dqn_keras._engine.tensorflow import keras, tf
 
 
 class _NarrowDense(keras.layers.Dense):
-    """Keras' Dense for a few outputs, such as the values of a few actions; only its gradient is written otherwise.
+    """Keras' Dense with another form of the gradient, for few outputs, such as the values of a few actions.
 
-    TensorFlow's gradient is two products with a transposed matrix, for which XLA has only slow loops where the
-    matrix is so narrow: a third of a whole learning step of the 4-64-2 network.
+    TensorFlow's gradient is two products with a transposed matrix. XLA compiles these to slow loops if the matrix is
+    narrow: they take a third of a learning step of the 4-64-2 network.
     """
 
     def call(self, inputs: tf.Tensor, training: bool | None = None) -> tf.Tensor:
@@ -18,7 +18,7 @@ class _NarrowDense(keras.layers.Dense):
 
 @tf.custom_gradient
 def _narrow_product(x: tf.Tensor, kernel: tf.Tensor) -> tuple[tf.Tensor, Callable]:
-    """The product of x [B, U] and kernel [U, A], and its gradient as a sum over the A columns."""
+    """Returns the product of x [B, U] and kernel [U, A], and its gradient as a sum over the A columns."""
 
     def gradient(dy: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:  # [B, A]
         columns = range(kernel.shape[1])

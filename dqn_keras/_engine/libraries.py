@@ -1,4 +1,4 @@
-"""Which code is a library's, and so stays the same while the process lives. All other code is the user's."""
+"""The difference between library code, which stays the same while the process runs, and the user's code."""
 
 import functools
 import sys
@@ -8,9 +8,9 @@ from types import FunctionType, ModuleType
 
 
 def is_of_a_library(code: FunctionType | type | ModuleType) -> bool:
-    """Whether a function, a class or a module is part of Python, of an installed package or of this one.
+    """Returns whether a function, class or module is part of Python, of an installed package or of this package.
 
-    The file decides that the code was compiled from. Names do not: functools.wraps copies them.
+    The source file of the code decides. Names are not reliable: functools.wraps copies them.
     """
     if isinstance(code, FunctionType):
         return _is_installed(code.__code__.co_filename)
@@ -21,7 +21,7 @@ def is_of_a_library(code: FunctionType | type | ModuleType) -> bool:
     if isinstance(code, type) and any(
         isinstance(x, FunctionType) and not is_of_a_library(x) for x in vars(code).values()
     ):
-        return False  # made by exec, which leaves it without a module
+        return False  # made by exec, so that it has no module
     return name.partition(".")[0] in sys.stdlib_module_names
 
 

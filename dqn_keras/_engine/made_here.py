@@ -1,4 +1,4 @@
-"""Which networks the package made itself, and so knows all of."""
+"""A record of the networks that the package made itself."""
 
 import weakref
 
@@ -9,10 +9,10 @@ _made_here: weakref.WeakSet[keras.Model] = weakref.WeakSet()
 
 
 def units_if_made_here(network: keras.Model) -> tuple[int, ...] | None:
-    """The sizes of all layers, states to actions, of a network that `make_q_network` made and nobody has altered.
+    """Returns the layer sizes, from states to actions, of an unchanged network of `make_q_network`; else None.
 
-    None for any other network, and where a layer was given another activation, a regularizer, a constraint or a method
-    of its own, or was frozen.
+    A network counts as changed if a layer has another activation, a regularizer, a constraint or its own `call`, or
+    if a layer is frozen.
     """
     if network not in _made_here or not is_relu_mlp(network):
         return None

@@ -8,10 +8,10 @@ from dqn_keras._engine.tensorflow import keras, tf
 
 
 def q_values(weights: Sequence[np.ndarray], state: np.ndarray) -> np.ndarray:
-    """Q(s, .) in NumPy: what a network of `make_q_network` computes, without TensorFlow's cost per call.
+    """Returns Q(s, .) of a network of `make_q_network`, computed in NumPy.
 
     Args:
-        weights: kernel [F, U] and bias [U] of each layer in turn, as `network.get_weights()` gives them.
+        weights: kernel [F, U] and bias [U] of each layer in order, as returned by `network.get_weights()`.
         state: [F], or [B, F], float32.
 
     Returns:
@@ -26,9 +26,10 @@ def q_values(weights: Sequence[np.ndarray], state: np.ndarray) -> np.ndarray:
 
 
 def q_function(q_network: keras.Model) -> Callable[[np.ndarray], np.ndarray]:
-    """One state [F] -> its Q-values [A], with the weights that `q_network` has now.
+    """Returns a function from one state [F] to its Q-values [A].
 
-    A network of `make_q_network`'s kind runs in NumPy, any other through TensorFlow (about 30 times slower).
+    A network of dense layers and ReLU, as made by `make_q_network`, runs in NumPy, with the weights that `q_network`
+    has now. Any other network runs in TensorFlow (about 30 times slower).
     """
     if is_relu_mlp(q_network):
         weights = q_network.get_weights()
@@ -38,7 +39,7 @@ def q_function(q_network: keras.Model) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def is_relu_mlp(q_network: keras.Model) -> bool:
-    """Whether `q_values` computes this network: dense layers, ReLU but for a linear last one."""
+    """Returns whether `q_values` can compute this network: dense layers with ReLU, and a linear last layer."""
     if type(q_network) is not keras.Sequential or "call" in vars(q_network):
         return False
     if not all(

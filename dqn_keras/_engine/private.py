@@ -1,4 +1,4 @@
-"""Private API of TensorFlow and Keras, all of it, each use with a public way that is taken where it is missing."""
+"""All uses of private API of TensorFlow and Keras. Each has a public fallback for versions without that API."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -9,9 +9,9 @@ from dqn_keras._engine.tensorflow import keras, tf
 
 @functools.cache
 def can_swap_variables() -> bool:
-    """Whether a traced function can be called with other variables in the place of those it was traced with.
+    """Returns whether a traced function can be called with other variables than those it was traced with.
 
-    If not, a program is traced for each agent, and called the public way: slower, with the same results.
+    If not, a program is traced for each agent and called through the public API: slower, with the same results.
     """
     try:
         first, second = tf.Variable(1.0), tf.Variable(2.0)
@@ -20,36 +20,36 @@ def can_swap_variables() -> bool:
         captured = list(concrete.captured_inputs)
         captured[index] = second.handle
         return caller(concrete)(tf.constant(3.0), *captured)[0].numpy() == 6.0
-    except Exception:  # whatever another version does instead
+    except Exception:  # another version can raise anything
         return False
 
 
 def caller(concrete: Any) -> Callable[..., list[tf.Tensor]]:
-    """A ConcreteFunction as a function of its arguments and everything it captures.
+    """Returns a ConcreteFunction as a function of its arguments and of everything that it captures.
 
-    Calling the ConcreteFunction itself would first bind its arguments to a signature, which takes half as long as a
+    A call of the ConcreteFunction itself first binds the arguments to a signature, which takes half as long as a
     learning step.
     """
     return concrete.inference_fn.call_flat
 
 
 def handle(variable: Any) -> tf.Tensor:
-    """What a traced function captures of a variable, Keras' or TensorFlow's."""
+    """Returns the tensor by which a traced function captures a Keras or TensorFlow variable."""
     return (variable.value if isinstance(variable, keras.Variable) else variable).handle
 
 
 def traced(function: Callable, specs: Sequence[tf.TensorSpec], jit_compile: bool | None = None) -> Any:
-    """`function` of tensors as in `specs` as a ConcreteFunction, which leaves nothing behind when it goes.
+    """Traces `function` for tensors as in `specs` to a ConcreteFunction that can be freed completely.
 
-    TensorFlow registers the gradient of every tf.custom_gradient for good, and each keeps a whole graph alive. They are
-    there to differentiate a function once more, which nobody does with this one. Those in a tf.function that it calls
-    stay: whoever made that may still need them.
+    TensorFlow registers the gradient of every tf.custom_gradient forever, and each one keeps a whole graph alive. They
+    serve to differentiate the function again, which is never done here, so they are removed. Gradients in a
+    tf.function that `function` calls stay: its owner may still need them.
     """
     try:
         from tensorflow.python.framework.ops import gradient_registry
 
         registry = gradient_registry._registry
-    except (ImportError, AttributeError):  # then they stay
+    except (ImportError, AttributeError):  # then the gradients stay registered
         registry = {}
     before = set(registry)
     concrete = tf.function(function, jit_compile=jit_compile, autograph=False).get_concrete_function(*specs)
@@ -60,7 +60,7 @@ def traced(function: Callable, specs: Sequence[tf.TensorSpec], jit_compile: bool
 
 
 def _gradients_of_functions_called(concrete: Any) -> set[str]:
-    """The names of the custom gradients in the functions that a graph calls, those in its own loops left out."""
+    """Returns the names of the custom gradients in the functions that a graph calls, except those in its own loops."""
     library = {function.signature.name: function for function in concrete.graph.as_graph_def().library.function}
     called, names = set(), set()
     to_do = [(concrete.function_def, False), *((function, False) for function in library.values())]
@@ -77,14 +77,14 @@ def _gradients_of_functions_called(concrete: Any) -> set[str]:
 
 
 def all_layers(network: keras.Model) -> list[keras.layers.Layer]:
-    """The layers of the network, those in nested models and in wrappers included."""
+    """Returns the layers of the network, including those in nested models and in wrappers."""
     if hasattr(network, "_flatten_layers"):
         return network._flatten_layers(include_self=False)
     return walk(network)
 
 
 def walk(network: keras.Model) -> list[keras.layers.Layer]:
-    """The same, the public way."""
+    """Returns the same layers as `all_layers`, found through the public API."""
     layers: list[keras.layers.Layer] = []
     to_do = list(network.layers)
     while to_do:
@@ -97,7 +97,7 @@ def walk(network: keras.Model) -> list[keras.layers.Layer]:
 
 
 def is_built_for(optimizer: keras.Optimizer, variables: Sequence[keras.Variable]) -> bool:
-    """Whether a built optimizer knows these variables; True where that cannot be seen, and Keras says so later."""
+    """Returns whether a built optimizer knows these variables; True if unknown, as Keras raises an error later."""
     try:
         optimizer._check_variables_are_known(variables)
     except ValueError:
@@ -108,7 +108,7 @@ def is_built_for(optimizer: keras.Optimizer, variables: Sequence[keras.Variable]
 
 
 def is_plain_adam(optimizer: keras.Optimizer, variables: Sequence[keras.Variable]) -> bool:
-    """Whether it is an Adam of which nothing but the learning rate was chosen, built for just these variables."""
+    """Returns whether it is an Adam built for exactly these variables, with defaults except for the learning rate."""
     if type(optimizer) is not keras.optimizers.Adam:
         return False
     rate, built_for = getattr(optimizer, "_learning_rate", None), getattr(optimizer, "_trainable_variables", [])
@@ -137,10 +137,10 @@ _PLAIN_ADAM = {
 
 
 def arguments_of_compile(network: keras.Model) -> dict[str, Any]:
-    """What `network.compile` was called with; nothing where that cannot be seen."""
+    """Returns the arguments of `network.compile`; empty if they are unknown."""
     return getattr(getattr(network, "_compile_config", None), "config", {})
 
 
 def output_shape_of_lambda(layer: keras.layers.Lambda) -> Any:
-    """As it was given; None where that cannot be seen, and Keras then finds it out."""
+    """Returns the given output shape; None if it is unknown, so that Keras computes it."""
     return getattr(layer, "_output_shape", None)

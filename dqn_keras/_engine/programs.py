@@ -1,9 +1,9 @@
-"""Compiled programs: those of the package's own networks are shared, everything else is traced as it is.
+"""Compiled programs. The package's own networks share them; the user's objects are traced as they are.
 
-TensorFlow traces a function for the variables that it names, and what XLA compiles from the trace is never freed: a
-second agent would cost seconds of compilation and megabytes that stay. So a program for networks that the package made,
-which it knows all of, is traced on a *stand-in* of the same sizes, and then called with any agent's variables in their
-place. A network or optimizer of the user's is never rebuilt: its program is traced on the objects themselves.
+TensorFlow traces a function for particular variables, and what XLA compiles from the trace is never freed: a second
+agent would cost seconds of compilation and megabytes of memory. Therefore a program for networks that the package made
+is traced once, on a *stand-in* of the same sizes, and then called with the variables of any agent. A network or
+optimizer of the user is never rebuilt: its program is traced on the objects themselves.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from dqn_keras.networks import make_q_network
 
 
 class Learner(NamedTuple):
-    """The three that a learning step changes."""
+    """The three objects that a learning step changes."""
 
     q_network: keras.Model
     q_hat_network: keras.Model
@@ -36,7 +36,7 @@ class Learner(NamedTuple):
 
     @property
     def variables(self) -> list[keras.Variable]:
-        """All that they hold, in an order that follows from how they were made."""
+        """All variables of the three objects, in an order that depends only on how they were made."""
         return [*self.q_network.variables, *self.q_hat_network.variables, *self.optimizer.variables]
 
     def prepare(self) -> None:
@@ -59,7 +59,7 @@ class Learner(NamedTuple):
             )
 
     def sizes(self) -> tuple[int, ...] | None:
-        """The sizes of the networks if the package made them and Adam is as Keras makes it; else None."""
+        """Returns the layer sizes if the package made the networks and the optimizer is a plain Adam; else None."""
         units = units_if_made_here(self.q_network)
         if units is None or units != units_if_made_here(self.q_hat_network):
             return None
@@ -67,7 +67,7 @@ class Learner(NamedTuple):
 
 
 def stand_in(units: Sequence[int], jit_compile: bool) -> Learner:
-    """Networks of these sizes, states to actions, and their Adam, with variables of their own."""
+    """Returns two new networks with these layer sizes, from states to actions, and a new Adam."""
     num_features, *hidden_units, num_actions = units
 
     def make() -> keras.Sequential:
@@ -84,9 +84,9 @@ def stand_in(units: Sequence[int], jit_compile: bool) -> Learner:
 
 class _Program(NamedTuple):
     function: Callable[..., list[tf.Tensor]]
-    """Of its arguments, and of what it captures."""
+    """The compiled function, called with its arguments followed by `captured`."""
     captured: list[int | tf.Tensor]
-    """What the function takes beside its arguments: the number of one of the learner's variables, or a constant."""
+    """Inputs that follow the arguments: each is the number of a variable, or a constant."""
 
 
 _shared: dict[Hashable, _Program] = {}
@@ -96,12 +96,12 @@ _of_this_study: dict[Hashable, _Program] | None = None
 
 
 _compiled: dict[Hashable, Any] = {}
-"""Functions traced from the user's parts, by their fingerprint: what XLA compiled for them stays in memory anyway."""
+"""All traced functions, by fingerprint: what XLA compiled for them stays in memory anyway."""
 
 
 @contextlib.contextmanager
 def shared_in(programs: dict) -> Iterator[None]:
-    """Within, programs with parts of the user's are kept in `programs`, for runs that differ in the seed alone."""
+    """Shares programs with the user's parts in `programs` inside the block, for runs that differ only in the seed."""
     global _of_this_study
     before, _of_this_study = _of_this_study, programs
     try:
@@ -120,17 +120,17 @@ def bind(
     has_own_parts: bool,
     jit_compile: bool,
 ) -> Callable[..., list[tf.Tensor]]:
-    """A compiled function of tensors that reads and changes `learner` and `variables`: tensors -> flat outputs.
+    """Returns a compiled function that reads and changes `learner` and `variables`: tensors -> list of outputs.
 
     Args:
-        make_function: a learner and further variables -> a function of tensors as in `specs`.
-        specs: of the arguments.
-        learner: the agent's own.
+        make_function: returns a function of tensors as in `specs`, given a learner and further variables.
+        specs: shapes and dtypes of the arguments.
+        learner: the agent's networks and optimizer.
         variables: further tf.Variables that the function changes.
-        key: tells apart the functions that `make_function` can make for learners of one size.
-        has_own_parts: whether the function calls something of the user's beside the learner; then it is traced again
-            at each call, except in a study.
-        jit_compile: by XLA.
+        key: distinguishes the functions that `make_function` can make for learners of the same sizes.
+        has_own_parts: whether the function calls code of the user other than the learner. If so, it is traced again
+            at each call of `bind`, except in a study.
+        jit_compile: whether XLA compiles the function.
     """
     if jit_compile:
         require_xla()
@@ -178,7 +178,7 @@ def _saying_what_xla_refused(call: Callable) -> Callable:
 def _trace(
     make_function: Callable, specs: Sequence, learner: Learner, variables: Sequence[tf.Variable], jit_compile: bool
 ) -> _Program:
-    """The program, traced on these very objects. If an equal one was compiled before, that is used."""
+    """Traces the program on exactly these objects. If an equal program was compiled before, that one is used."""
     concrete = _traced(make_function(learner, variables), specs, jit_compile)
     numbers = {id(handle): i for i, handle in enumerate(_handles(learner, variables))}
     captured = [numbers.get(id(x), x) for x in concrete.captured_inputs]

@@ -1,4 +1,4 @@
-"""Networks and optimizers of runs that have ended, kept for the next run with the same sizes: new ones take 25 ms."""
+"""Networks and optimizers of finished runs, kept for the next run with the same sizes: new ones take 25 ms."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ _kept: dict[tuple[int, ...], Learner] = {}
 
 
 def recycle(learner: Learner) -> None:
-    """Keeps a learner that nobody uses any more, if the package made all of it."""
+    """Keeps a learner that is no longer used, if the package made all of it."""
     if sizes := learner.sizes():
         _kept[sizes] = learner
 
 
 def recycled(sizes: tuple[int, ...], alpha: float, seed: np.random.SeedSequence) -> Learner | None:
-    """Returns a kept learner, reset to what a new one for `alpha` and `seed` would be; None if there is none."""
+    """Returns a kept learner, reset to equal a new one for `alpha` and `seed`; None if there is none."""
     learner = _kept.pop(sizes, None)
     if learner:
         renew_weights(learner.q_network, seed)

@@ -1,4 +1,4 @@
-"""The compiled learning step of `learn`, kept as long as nothing that it was compiled for has changed."""
+"""The compiled learning step of `learn`, kept until something that it was compiled for changes."""
 
 import dataclasses
 import warnings
@@ -15,7 +15,7 @@ from dqn_keras.checks.networks import warn_of_inference_mode
 
 
 class _Step(NamedTuple):
-    """A compiled step, and what it was compiled for."""
+    """A compiled step and the objects that it was compiled for."""
 
     parts: tuple[Any, ...]
     watch: Watch
@@ -24,7 +24,7 @@ class _Step(NamedTuple):
 
 @dataclasses.dataclass
 class _Steps:
-    """The compiled steps of one network. The network holds them, so that they go when it goes."""
+    """The compiled steps of one network. The network holds them, so that they are freed with it."""
 
     kept: list[_Step] = dataclasses.field(default_factory=list)
     num_compiled: int = 0
@@ -39,8 +39,8 @@ def compiled_step(
     """Returns `make_step(learner)`, compiled for these objects; the compiled step is kept until one of them changes.
 
     The step takes seven tensors: states, actions, rewards, next_states, terminal_states, gamma and tau. `key` is None
-    for formulas of the user's. The step then takes a batch of `batch_size` only, so that the shapes which the formulas
-    return can be checked. Otherwise `key` names the package's formulas, and the step takes a batch of any size.
+    for the user's formulas. The step then takes only batches of `batch_size`, so that the shapes that the formulas
+    return can be checked. Otherwise `key` names the package's formulas, and the step takes batches of any size.
     """
     size = batch_size if key is None else None
     parts = (*learner, *formulas, size, jit)

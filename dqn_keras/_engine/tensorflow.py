@@ -1,6 +1,6 @@
-"""TensorFlow and Keras, imported without a word, and Keras checked to run on TensorFlow.
+"""TensorFlow and Keras, imported without log output, after a check that Keras runs on TensorFlow.
 
-The other modules take `keras` and `tf` from here, so that it does not matter which of them is imported first.
+All other modules import `keras` and `tf` from here, so that the order in which they are imported does not matter.
 """
 
 import contextlib
@@ -11,10 +11,10 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def _native_stderr_silenced() -> Iterator[None]:
-    """Send descriptor 2 to nowhere: TensorFlow's C++ code logs there before its log level is read."""
+    """Discards output to file descriptor 2: TensorFlow's C++ code logs there before it reads its log level."""
     try:
         saved = os.dup(2)
-    except OSError:  # a process without a standard error has nothing to silence
+    except OSError:  # a process without standard error has nothing to silence
         yield
         return
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -28,7 +28,7 @@ def _native_stderr_silenced() -> Iterator[None]:
 
 
 def require_tensorflow_backend(name: str) -> None:
-    """ImportError, with what to do, if `name` is not the backend that the package needs."""
+    """Raises ImportError, with the remedy, if the backend `name` is not TensorFlow."""
     if name != "tensorflow":
         raise ImportError(
             f"dqn_keras needs Keras on TensorFlow, not on {name!r}: "
@@ -37,14 +37,14 @@ def require_tensorflow_backend(name: str) -> None:
 
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # errors still show
-# A window that pygame opens with OpenGL kills a process that has TensorFlow in it: both bring an LLVM of their own.
+# If pygame opens a window with OpenGL, a process with TensorFlow crashes: each of the two loads its own LLVM.
 os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
 require_tensorflow_backend(os.environ.get("KERAS_BACKEND", "tensorflow"))
 with _native_stderr_silenced():
     import keras
     import tensorflow as tf
 
-    tf.config.list_physical_devices()  # it looks for GPUs once, and complains where there is none
+    tf.config.list_physical_devices()  # TensorFlow looks for GPUs once, and logs errors if there is none
 require_tensorflow_backend(keras.backend.backend())
 
 __all__ = ["keras", "require_xla", "tf"]
@@ -52,7 +52,7 @@ __all__ = ["keras", "require_xla", "tf"]
 
 @functools.cache
 def require_xla() -> None:
-    """RuntimeError, with what to do, where TensorFlow has no XLA compiler for this machine."""
+    """Raises RuntimeError, with the remedy, if TensorFlow has no XLA compiler for this machine."""
     try:
         _compile_something()
     except tf.errors.OpError as error:

@@ -1,7 +1,7 @@
-"""Whether something that a compiled program was traced from has been changed since.
+"""Detection of changes to the objects that a compiled program was traced from.
 
-A trace reads attributes, closures and global names once. `Watch` remembers what they were: a look at it takes a few
-microseconds, where tracing again takes a second.
+A trace reads attributes, closures and global names once. `Watch` remembers their values: a comparison takes a few
+microseconds, while a new trace takes a second.
 """
 
 import argparse
@@ -32,24 +32,26 @@ _SEQUENCES = (list, tuple, set, frozenset, deque, UserList)
 _NAMESPACES = (SimpleNamespace, argparse.Namespace)
 
 
-_LARGEST_CONTAINER = 1_000  # beyond, what is in it is not looked at
+_LARGEST_CONTAINER = 1_000  # the contents of a larger one are not compared
 
 
 class _Look(NamedTuple):
     name: str
-    """Of what is looked at, for a message."""
+    """Name of the object, for a message."""
     look: Callable[[], Any]
     seen: Any
 
 
 class Watch:
-    """The state of some objects, as far as a trace can have read it.
+    """The state of some objects, as far as a trace can read it.
 
-    Seen are the attributes of Keras' objects and of the user's own, methods and attributes of the user's classes, and
-    of the user's functions the code, the closure and the global names they use, through any number of such steps. Of
-    the object of a bound method, the attributes count that the method and those it calls name.
-    Containers and arrays of more than a thousand items are taken for the same as long as they are the same object, and
-    so are those in private attributes of Keras' objects, and a whole number is for an equal float.
+    The state contains, recursively:
+    - the attributes of Keras objects, and of the user's objects and classes, with their methods;
+    - the code, the closure and the used global names of the user's functions;
+    - for a bound method, only those attributes of its object that are named in the method or in the methods it calls.
+
+    Some changes are not seen: inside a container or array of more than a thousand items; inside a container that a
+    private attribute of a Keras object holds; and the change of a whole number to an equal float.
     """
 
     def __init__(self, *parts: Any) -> None:
@@ -59,14 +61,14 @@ class Watch:
             self._visit(part)
 
     def is_unchanged(self) -> bool:
-        """Whether all is as it was."""
+        """Returns whether nothing has changed."""
         try:
             return all(look() == seen for _, look, seen in self._looks)
-        except Exception:  # arrays and tensors that are other ones cannot be compared like that
+        except Exception:  # arrays and tensors that were replaced cannot be compared in this way
             return False
 
     def what_changed(self) -> str:
-        """The name of the first thing that has changed."""
+        """Returns the name of the first thing that has changed."""
         for name, look, seen in self._looks:
             now = look()
             if isinstance(now, dict):
@@ -114,7 +116,7 @@ class Watch:
 
     def _visit_function(self, function: FunctionType) -> None:
         if is_of_a_library(function):
-            if function.__closure__:  # a decorator's, which may hold a function of the user's
+            if function.__closure__:  # a decorator's closure may hold a function of the user
                 self._look(function.__qualname__, lambda: _closure(function))
         else:
             constants = lambda: (function.__code__, function.__defaults__, function.__kwdefaults__)  # noqa: E731
@@ -131,7 +133,7 @@ class Watch:
             self._look(type(owner).__qualname__, lambda: {k: x for k, x in _attributes(owner).items() if k in names})
 
     def _visit_model(self, model: keras.Model) -> None:
-        """A model computes what its layers do. `fit` and `predict` put other attributes into it."""
+        """Visits the layers and the attributes that the model's own code uses; `fit` and `predict` add others."""
         self._visit(type(model))
         own = [f for c in type(model).__mro__ if not is_of_a_library(c) for f in vars(c).values()]
         names = {name for f in own if isinstance(f, FunctionType) for name in _names(f.__code__)} | {"call"}
@@ -142,10 +144,9 @@ class Watch:
         self._visit(type(part))
         attributes = vars(part)
         self._looks.append(_Look(type(part).__qualname__, lambda: attributes, dict(attributes)))
-        is_users = not is_of_a_library(type(part))
         for name, attribute in attributes.items():
-            if not isinstance(attribute, list | dict | tuple | set) or (is_users and name[0] != "_"):
-                self._visit(attribute)  # in other containers Keras keeps its books
+            if name[0] != "_" or not isinstance(attribute, list | dict | tuple | set):
+                self._visit(attribute)  # Keras keeps its records in the other containers
 
     def _look(self, name: str, look: Callable[[], list | dict]) -> None:
         seen = look()
@@ -165,7 +166,7 @@ def _are_equal(now: Any, then: Any) -> bool:
 
 
 def _decorated(value: Any) -> Any:
-    """The function that a library's decorator was put on, such as tf.function or tf.custom_gradient; None if none."""
+    """Returns the function inside a library's decorator, such as tf.function or tf.custom_gradient; None if none."""
     return (
         getattr(value, "python_function", None) or vars(value).get("__wrapped__")
         if hasattr(value, "__dict__")
@@ -174,13 +175,13 @@ def _decorated(value: Any) -> Any:
 
 
 def _attributes(value: Any) -> dict[str, Any]:
-    """Those of an object, in its __dict__ or in __slots__."""
+    """Returns the attributes of an object, from its __dict__ and its __slots__."""
     slots = [name for cls in type(value).__mro__ for name in vars(cls).get("__slots__", ())]
     return getattr(value, "__dict__", {}) | {name: getattr(value, name) for name in slots if hasattr(value, name)}
 
 
 def _of_class(cls: type, names: frozenset[str] | None = None) -> dict[str, Any]:
-    """A class's own attributes, all or those of `names`."""
+    """Returns a class's own attributes: all, or only those in `names`."""
     return {name: x for name, x in vars(cls).items() if names is None or name in names}
 
 
@@ -189,18 +190,18 @@ def _closure(function: FunctionType) -> dict[str, Any]:
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         try:
             read[name] = cell.cell_contents
-        except ValueError:  # not filled yet
+        except ValueError:  # an empty cell
             read[name] = None
     return read
 
 
 def read_by(function: FunctionType) -> dict[str, Any]:
-    """What the function's closure and global names hold now, by name, and what it reads of the user's modules."""
+    """Returns by name the current values of the function's closure, globals and names in the user's modules."""
     read, code, globals_ = _closure(function), function.__code__, function.__globals__
     for name in _global_names(code):
         if name in globals_:
             read[name] = globals_[name]
-        else:  # it may be imported within the function
+        else:  # it may be imported inside the function
             relative = f"{globals_.get('__package__')}.{name}".rstrip(".")
             read[name] = sys.modules.get(name, sys.modules.get(relative))
     modules = {name: x for name, x in read.items() if _is_users_module(x)}
@@ -221,7 +222,7 @@ def _is_users_module(value: Any) -> bool:
 
 @functools.cache
 def _names(code: CodeType) -> frozenset[str]:
-    """The names that the code and the functions in it use: global ones, and attributes."""
+    """Returns the names of globals and attributes that the code and its inner functions use."""
     return frozenset(code.co_names).union(*map(_names, _inner(code)))
 
 
@@ -230,7 +231,7 @@ _OPS = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS", "IMPORT_NAME")
 
 @functools.cache
 def _global_names(code: CodeType) -> frozenset[str]:
-    """Of them, the global ones and those of modules that are imported within."""
+    """Returns the names of globals and of imported modules that the code and its inner functions use."""
     used = {x.argval for x in dis.get_instructions(code) if x.opname in _OPS}
     return frozenset(used).union(*map(_global_names, _inner(code)))
 
@@ -240,7 +241,7 @@ def _inner(code: CodeType) -> Iterator[CodeType]:
 
 
 def _names_reached(method: MethodType) -> frozenset[str]:
-    """The names that a method uses, and the methods of its object that it calls."""
+    """Returns the names that are used by a method and by the methods of its object that it calls."""
     names: set[str] = set()
     to_do: list[Any] = [method.__func__]
     while to_do:

@@ -1,1 +1,1 @@
-"""What is checked at the doors: numbers, batches, networks, environments."""
+"""Checks of the input of public functions: numbers, batches, networks, environments."""

@@ -1,4 +1,4 @@
-"""Checks of a batch at the doors of the learning step."""
+"""Checks of a batch before a learning step."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -13,10 +13,13 @@ from dqn_keras.replay import Experience
 
 
 def as_batch(experiences: Sequence[Any], state_shape: tuple[int, ...], num_actions: int) -> Experience:
-    """Any five arrays as tensors of the right dtypes; an error that names the field if one cannot be that.
+    """Returns any five arrays as a batch of tensors with the right dtypes.
 
-    A reward of shape [B, 1] would otherwise silently broadcast against [B] to a loss over [B, B]. Values are
-    checked where there are any: inside a tf.function there are not.
+    Without the check of shapes, a reward of shape [B, 1] would silently broadcast against [B] to a loss over [B, B].
+    Values are not checked inside a tf.function, where they are not known.
+
+    Raises:
+        ValueError: a field's shape, dtype or value is wrong; the message names the field.
     """
     if len(experiences) != len(_PLURALS):
         raise ValueError(f"experiences must be the five fields {', '.join(_PLURALS)}, got {len(experiences)}")
@@ -55,7 +58,7 @@ def _checked(name: str, field: Any, shape: list, num_actions: int) -> tf.Tensor:
 
 
 def as_share(name: str, value: Any) -> tf.Tensor:
-    """A number in [0, 1] as a float32 scalar."""
+    """Returns a number in [0, 1] as a float32 scalar."""
     if not tf.is_tensor(value) or (tf.executing_eagerly() and hasattr(value, "numpy")):
         value = check_number(name, np.asarray(value)[()], at_least=0, at_most=1)
     elif value.shape.rank != 0:
@@ -67,7 +70,7 @@ _PLURALS = ("states", "actions", "rewards", "next_states", "terminal_states")
 
 
 def takes_a_batch(formula: Callable) -> Callable:
-    """Lets `formula` be called with any five arrays: they are checked, and reach it as an Experience of tensors."""
+    """Makes `formula` take any five arrays: they are checked and passed on as an Experience of tensors."""
 
     @functools.wraps(formula)
     def checked(

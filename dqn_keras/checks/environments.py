@@ -1,4 +1,4 @@
-"""The door between an environment and the rest: what comes through it is of the right kind, and finite."""
+"""Checks of environments: whether they are supported, and whether all that they return is valid and finite."""
 
 import math
 from collections.abc import Callable
@@ -13,10 +13,10 @@ from dqn_keras.checks.networks import check_fits
 
 
 class CheckedEnv:
-    """A gymnasium.Env with Box observations and Discrete actions, its words checked.
+    """A gymnasium.Env with Box observations and Discrete actions, whose return values are checked.
 
-    States come out as copies [*S] (an environment may reuse its buffer), actions go in as indices from 0.
-    Whatever else comes raises ValueError with the environment's name, the episode and the step.
+    States are returned as copies [*S], since an environment may reuse its buffer. Actions are indices from 0.
+    A wrong return value raises ValueError with the environment's name, the episode and the step.
     """
 
     def __init__(self, env: gym.Env) -> None:
@@ -28,7 +28,7 @@ class CheckedEnv:
         self._is_uint8 = self.spaces.state_dtype == np.uint8
 
     def reset(self, seed: int, episode: int) -> np.ndarray:
-        """Begin an episode with the environment seeded: its first state. The number is for messages."""
+        """Begins an episode with the given seed and returns its first state. `episode` is its number, for messages."""
         self._episode, self._step = episode, -1
         result = self._call(self._env.reset, seed=seed)
         if not (isinstance(result, tuple) and len(result) == 2):
@@ -36,7 +36,7 @@ class CheckedEnv:
         return self._checked_state(result[0])
 
     def step(self, a: int) -> tuple[np.ndarray, float, bool, bool]:
-        """Next state, reward, terminated, truncated after the action of index `a`."""
+        """Takes the action of index `a` and returns next state, reward, terminated, truncated."""
         self._step += 1
         result = self._call(self._env.step, self.spaces.first_action + a)
         try:
@@ -83,28 +83,28 @@ class CheckedEnv:
 
 
 class Spaces(NamedTuple):
-    """What a network must know of an environment."""
+    """The sizes and types of an environment's states and actions."""
 
     state_shape: tuple[int, ...]
     state_dtype: np.dtype
-    """uint8 where the observations are that, as images are; float32 for all others."""
+    """uint8 if the observations are uint8, as images are; otherwise float32."""
     num_actions: int
     first_action: int
-    """What the environment calls the action of index 0."""
+    """The environment's number for the action of index 0."""
 
 
 def some_states(space: Any, dtype: np.dtype, num_states: int = 8) -> np.ndarray:
-    """States within the bounds of a space to try a network on, [num_states, *S]; always the same."""
+    """Returns states within the bounds of a space to test a network with, [num_states, *S]; always the same ones."""
     rng = np.random.default_rng(0)
     normal, uniform = rng.normal(size=(num_states, *space.shape)), rng.random((num_states, *space.shape))
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-    is_bounded = (low > -1e6) & (high < 1e6)  # a space without bounds may say so by a huge number
+    is_bounded = (low > -1e6) & (high < 1e6)  # a huge number may mean that there is no bound
     within = np.where(is_bounded, low, 0) + np.where(is_bounded, high - low, 0) * uniform
     return np.where(is_bounded, within, np.clip(normal, low, high)).astype(dtype)
 
 
 def check_spaces(name: str, observations: gym.Space, actions: gym.Space) -> Spaces:
-    """The sizes of the two spaces; ValueError if they are not supported."""
+    """Returns the sizes of the two spaces; raises ValueError if they are not supported."""
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         raise ValueError(
             f"env {name} has the observation space {observations}; supported is a Box of at least one axis "
@@ -123,7 +123,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 def check_functional(env: FuncEnv) -> Spaces:
-    """The sizes of its spaces; an error that names the environment if the loop cannot play it."""
+    """Returns the sizes of the environment's spaces; raises ValueError if the compiled loop cannot play it."""
     require_xla()
     name = type(env).__name__
     spaces = check_spaces(name, env.observation_space, env.action_space)
@@ -146,7 +146,11 @@ def check_functional(env: FuncEnv) -> Spaces:
 
 
 def check_environment(env: gym.Env | FuncEnv, q_network: keras.Model | None = None) -> Spaces:
-    """The sizes of its spaces; ValueError if they are not supported, or not by the network (None: the default one)."""
+    """Returns the sizes of the environment's spaces.
+
+    Raises:
+        ValueError: the spaces are not supported, or do not fit `q_network` (None: the default network).
+    """
     if isinstance(env, FuncEnv):
         name, spaces = type(env).__name__, check_functional(env)
     else:

@@ -1,4 +1,4 @@
-"""The two formulas of a gradient step, targets and loss, and what they must return."""
+"""The two formulas of a gradient step, targets and loss, and checks of what they return."""
 
 import inspect
 from collections.abc import Callable
@@ -8,13 +8,13 @@ from dqn_keras._engine.tensorflow import keras, tf
 
 
 class Formulas(NamedTuple):
-    """What a gradient step computes: the targets, and the loss of them."""
+    """The formulas of a gradient step: the targets and the loss."""
 
     targets: Callable
     loss: str | Callable
 
     def check(self) -> None:
-        """Raises TypeError or ValueError if one of them is not what `learn` takes."""
+        """Raises TypeError or ValueError if `learn` cannot take one of them."""
         if not callable(self.targets):
             raise TypeError(f"targets must be a function like td_targets, got {self.targets!r}")
         if isinstance(self.loss, str):
@@ -28,7 +28,7 @@ class Formulas(NamedTuple):
             _check_takes("loss", self.loss, ("y", "q"))
 
     def loss_function(self) -> Callable:
-        """The loss as something to call; ValueError if Keras does not know its name."""
+        """Returns the loss as a function; raises ValueError if Keras does not know its name."""
         if not isinstance(self.loss, str):
             return self.loss
         try:
@@ -37,7 +37,7 @@ class Formulas(NamedTuple):
             raise ValueError(f"loss must be a name that Keras knows, such as 'mse', got {self.loss!r}") from None
 
     def y(self, experiences: Any, gamma: Any, q_network: keras.Model, q_hat_network: keras.Model) -> tf.Tensor:
-        """The targets [B], to which no gradient flows."""
+        """Returns the targets [B], through which no gradient flows."""
         y = self.targets(experiences, gamma, q_network, q_hat_network)
         batch_shape = experiences.reward.shape
         is_vector = tf.is_tensor(y) and y.shape.rank == 1 and y.shape.is_compatible_with(batch_shape)
@@ -47,11 +47,11 @@ class Formulas(NamedTuple):
         return tf.stop_gradient(y)
 
     def loss_of(self, y: tf.Tensor, q: tf.Tensor) -> tf.Tensor:
-        """The loss of targets [B] and values [B], a scalar. One value for each transition counts as their mean."""
+        """Returns the loss of targets [B] and values [B], a scalar. A loss per transition is averaged."""
         loss = self.loss_function()
-        is_the_originals = loss is keras.losses.mean_squared_error  # of two vectors, as the original has it
+        is_the_originals = loss is keras.losses.mean_squared_error  # called with two vectors, as in the original
         if isinstance(loss, keras.losses.Loss) or (isinstance(self.loss, str) and not is_the_originals):
-            y, q = y[:, None], q[:, None]  # [B, 1], as `fit` has them: Keras takes the last axis for that of a sample
+            y, q = y[:, None], q[:, None]  # [B, 1], as in `fit`: Keras reduces over the last axis
         value = loss(y, q)
         if not tf.is_tensor(value) or not (value.shape.rank == 0 or value.shape.is_compatible_with(y.shape[:1])):
             got = f"shape {value.shape}" if tf.is_tensor(value) else repr(value)
@@ -60,10 +60,10 @@ class Formulas(NamedTuple):
 
 
 def _check_takes(name: str, function: Callable, arguments: tuple[str, ...]) -> None:
-    """TypeError if the function cannot be called with so many arguments."""
+    """Raises TypeError if the function cannot be called with this number of arguments."""
     try:
         inspect.signature(function, follow_wrapped=False).bind(*arguments)
-    except ValueError:  # it has no signature that Python knows
+    except ValueError:  # Python does not know its signature
         pass
     except TypeError as error:
         raise TypeError(f"{name} must be a function of ({', '.join(arguments)}), got {function!r}: {error}") from None

@@ -11,7 +11,10 @@ from dqn_keras._engine.tensorflow import keras, tf
 
 
 def check_network(name: str, network: keras.Model) -> None:
-    """TypeError or ValueError if it is no built Sequential or functional model, states [B, *S] -> Q-values [B, A]."""
+    """Raises TypeError or ValueError unless `network` maps states [B, *S] to Q-values [B, A].
+
+    It must be a built Sequential or functional model.
+    """
     if not isinstance(network, keras.Sequential | keras.models.Model):
         raise TypeError(f"{name} must be a Keras model, got {network!r}")
     if not network.built or not hasattr(network, "input_shape"):
@@ -20,7 +23,7 @@ def check_network(name: str, network: keras.Model) -> None:
         if len(tensors) != 1:
             raise ValueError(f"{name} must have one {kind}, got {len(tensors)}")
     output = network.outputs[0] if isinstance(network, keras.Sequential) else network.output
-    is_tensor = isinstance(output, keras.KerasTensor)  # neither a list nor a dictionary of one
+    is_tensor = isinstance(output, keras.KerasTensor)  # not a list or dictionary that holds one
     if not is_tensor or len(output.shape) != 2 or output.shape[1] is None:
         got = output.shape if is_tensor else f"a {type(output).__name__}"
         raise ValueError(f"{name} must give Q-values of shape [B, A], got output {got}")
@@ -29,7 +32,7 @@ def check_network(name: str, network: keras.Model) -> None:
 
 
 def check_fits(q_network: keras.Model, state_shape: tuple[int, ...], num_actions: int) -> None:
-    """ValueError if the network does not take this environment's states or give its actions' values, all finite."""
+    """Raises ValueError if the network does not fit the environment's states and actions, or has non-finite weights."""
     check_network("q_network", q_network)
     takes, gives = q_network.input_shape, q_network.output_shape
     fits = isinstance(takes, tuple) and tf.TensorShape(takes).is_compatible_with((None, *state_shape))
@@ -47,13 +50,13 @@ def _without_batch(shape: Any) -> Any:
 
 
 def check_optimizer(optimizer: Any) -> None:
-    """TypeError if it is not one of Keras."""
+    """Raises TypeError if `optimizer` is not a Keras optimizer."""
     if not isinstance(optimizer, keras.Optimizer):
         raise TypeError(f"optimizer must be a Keras optimizer such as keras.optimizers.Adam(1e-3), got {optimizer!r}")
 
 
 def warn_of_inference_mode(network: keras.Model) -> None:
-    """Warns of layers that would do something else in training: a Q-network is always called in inference mode."""
+    """Warns of layers that behave differently in training: a Q-network is always called in inference mode."""
     if names := [f"{x.name} ({type(x).__name__})" for x in all_layers(network) if _differs_in_training(x)]:
         warnings.warn(
             f"q_network is called in inference mode, also while it learns: {', '.join(names)} will not do there what "
@@ -65,7 +68,7 @@ def warn_of_inference_mode(network: keras.Model) -> None:
 def _differs_in_training(layer: keras.layers.Layer) -> bool:
     if isinstance(layer, keras.layers.BatchNormalization | keras.layers.SpectralNormalization):
         return True
-    if type(layer).__name__.endswith("Cell"):  # whose RNN is one of the layers, too
+    if type(layer).__name__.endswith("Cell"):  # the RNN around it is one of the layers, too
         return False
     if not type(layer).__module__.startswith("keras."):
         return "training" in inspect.signature(type(layer).call).parameters

@@ -11,7 +11,7 @@ LARGEST_COUNT = 2**31 - 1
 
 
 def check_count(name: str, value: Any, at_least: int = 1) -> int:
-    """Returns the whole number `value` as an int; TypeError or ValueError that names it otherwise."""
+    """Returns the whole number `value` as an int; otherwise raises TypeError or ValueError that names it."""
     wanted = f"{name} must be a whole number from {at_least} to {LARGEST_COUNT}"
     if isinstance(value, bool | np.bool_) or not isinstance(value, Integral):
         raise TypeError(f"{wanted}, got {value!r}")
@@ -23,14 +23,14 @@ def check_count(name: str, value: Any, at_least: int = 1) -> int:
 def check_number(
     name: str, value: Any, *, above: float | None = None, at_least: float | None = None, at_most: float | None = None
 ) -> float:
-    """The finite number `value` as a float, or an error that names it."""
+    """Returns the finite number `value` as a float; otherwise raises TypeError or ValueError that names it."""
     limits = [("above", above), ("at least", at_least), ("at most", at_most)]
     wanted = f"{name} must be a finite number " + ", ".join(f"{word} {x}" for word, x in limits if x is not None)
     if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
         raise TypeError(f"{wanted.rstrip()}, got {value!r}")
     try:
         converted = float(value)
-    except OverflowError:  # a whole number beyond the floats
+    except OverflowError:  # a whole number too large for a float
         converted = math.inf
     if (
         not math.isfinite(converted)
@@ -43,7 +43,7 @@ def check_number(
 
 
 def check_counts(name: str, values: Any) -> tuple[int, ...]:
-    """A sequence of whole numbers above 0 as a tuple of ints, or an error that names it."""
+    """Returns a sequence of whole numbers above 0 as a tuple of ints; otherwise raises TypeError or ValueError."""
     if isinstance(values, np.ndarray) and values.ndim == 1:
         values = list(values)
     if isinstance(values, str | bytes) or not isinstance(values, Sequence):

@@ -1,4 +1,4 @@
-"""Checks of what `train` and `study` are called with."""
+"""Checks of the arguments of `train` and `study`."""
 
 import math
 import warnings
@@ -16,7 +16,7 @@ from dqn_keras.config import Config
 
 
 def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> None:
-    """TypeError or ValueError that names the one which cannot be used."""
+    """Raises TypeError or ValueError that names the wrong argument, if there is one."""
     if not isinstance(env, gym.Env | FuncEnv):
         raise TypeError(f"env must be a gymnasium.Env or a FuncEnv, got {env!r}")
     if not isinstance(config, Config):
@@ -30,7 +30,7 @@ def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> Non
 def check_callbacks(
     callbacks: keras.callbacks.Callback | Sequence[keras.callbacks.Callback],
 ) -> list[keras.callbacks.Callback]:
-    """Returns one callback, or several, as a list; TypeError if one is none of Keras."""
+    """Returns one or several callbacks as a list; raises TypeError if one is not a Keras callback."""
     callbacks = [callbacks] if isinstance(callbacks, keras.callbacks.Callback) else list(callbacks)
     for callback in callbacks:
         if not isinstance(callback, keras.callbacks.Callback):
@@ -45,7 +45,10 @@ def check_own_parts(
     targets: Callable,
     loss: str | Callable | None,
 ) -> Formulas:
-    """The formulas to learn by; TypeError, ValueError or a warning for what cannot be used, or not as it is meant."""
+    """Returns the formulas to learn with; raises TypeError or ValueError if one of the parts cannot be used.
+
+    Warns of settings of the parts that have no effect or another effect than in `model.fit`.
+    """
     if optimizer is not None:
         check_optimizer(optimizer)
     owners = owners_optimizer(q_network)
@@ -71,7 +74,10 @@ _IGNORED = ("metrics", "weighted_metrics", "loss_weights", "run_eagerly")
 
 
 def check_learning_rate(optimizer: keras.Optimizer, config: Config) -> None:
-    """ValueError if alpha says something else; a warning if it is a Python function, which is not called each time."""
+    """Raises ValueError if `config.alpha` was set to another value than the optimizer's learning rate.
+
+    Warns if the learning rate is a Python function, because that is called only once.
+    """
     rate = optimizer.learning_rate
     is_alpha = isinstance(rate, keras.Variable) and math.isclose(rate.numpy(), config.alpha, rel_tol=1e-6)
     if config.alpha != Config.alpha and not is_alpha:

@@ -1,1 +1,1 @@
-"""The two loops that play and learn: step by step in Gymnasium, or whole episodes compiled."""
+"""The two loops that play and learn: step by step in Gymnasium, or in compiled programs of whole episodes."""

@@ -1,7 +1,7 @@
 """Whole episodes of a functional environment in one program that XLA compiles: act, step, remember, learn.
 
-Three loops stand in one another: episodes; in them turns, each of which ends with an update; in them the env steps
-up to that update. Nothing random outlives a turn: its draws follow from the run's seed, the episode and the turn.
+Three loops are nested: over episodes, over the turns of an episode, and over the env steps of a turn. A turn ends with
+an update. The random draws of a turn depend only on the run's seed, the episode and the turn.
 """
 
 import functools
@@ -38,11 +38,11 @@ def episodes(
     episodes_per_call: int = 100,
     formulas: Formulas = DEFAULT_FORMULAS,
 ) -> Generator[Episode, None, None]:
-    """Play and learn, episode after episode, until the run's last; `agent` is changed in place.
+    """Plays and learns until the run's last episode, and yields each episode; `agent` is changed in place.
 
-    Several are played in one call of the program, up to `episodes_per_call` (at most 100) or about `_SECONDS_PER_CALL`,
-    so that a run can be interrupted; it returns early where the stop rule may hold, and the agent is then as that
-    episode left it. The results do not depend on the number.
+    One call of the program plays up to `episodes_per_call` episodes (at most 100), or for about `_SECONDS_PER_CALL`, so
+    that a run can be interrupted. It returns early if the stop rule may hold. The agent then has the state of the end
+    of that episode. The results do not depend on `episodes_per_call`.
     """
     memory = agent.memory
     rows = tf.Variable(memory.rows)
@@ -81,25 +81,25 @@ _SECONDS_PER_CALL = 0.25
 
 
 _CAPACITY = 100
-"""Episodes that one call can play."""
+"""Maximum number of episodes in one call."""
 
 
 class _Numbers(NamedTuple):
-    """What goes into the program at each call; another value costs no compilation."""
+    """The inputs of the program at each call; other values need no new compilation."""
 
-    key: Any  # int64, which all draws follow from
+    key: Any  # int64, the source of all draws
     first: Any  # int32, the number of the first episode
     num_episodes: Any  # int32
     max_steps: Any  # int32
     epsilons: Any  # [_CAPACITY] float32
-    recent: Any  # [solved_window] float64, the rewards of the episodes before
+    recent: Any  # [solved_window] float64, the rewards of the last episodes
     solved_reward: Any  # float64
     gamma: Any  # float32
     tau: Any  # float32
 
 
 def _numbers(env: FuncEnv, agent: Agent, config: Config, epsilons: list[float], num_episodes: int) -> _Numbers:
-    recent = np.full(config.solved_window, -np.inf)  # as if hopeless episodes had come before the first
+    recent = np.full(config.solved_window, -np.inf)  # missing episodes keep the mean below any solved_reward
     rewards_before = [episode.reward for episode in agent.episodes[-config.solved_window :]]
     recent[config.solved_window - len(rewards_before) :] = rewards_before
     return _Numbers(
@@ -148,7 +148,7 @@ def _bind_program(
 
 
 def _constants(cls: type) -> Hashable:
-    """What an environment of this package reads, which may be changed to try out another physics."""
+    """Returns the constants of an environment of this package: a user may change them to try other physics."""
     named = vars(sys.modules[cls.__module__]) | vars(cls)
     values = {name: x for name, x in named.items() if name[:2] != "__" and not isinstance(x, ModuleType | type)}
     return tuple((name, x if isinstance(x, FunctionType) else (type(x), repr(x))) for name, x in values.items())
@@ -161,18 +161,18 @@ _DIVERGED = 3
 
 
 class _Totals(NamedTuple):
-    """What comes out of the program: of one episode, or, with a leading axis, of several."""
+    """The outputs of the program for one episode or, with a leading axis, for several."""
 
     reward: Any  # float64
     steps: Any  # int32
-    sums: Any  # [3] float32, over the updates, of loss, mean_q, td_error
+    sums: Any  # [3] float32, sums of loss, mean_q, td_error over the updates
     max_q: Any  # float32
     max_reward: Any  # float32
     updates: Any  # int32
     terminated: Any  # bool
 
     def episode(self, i: int, number: int, epsilon: float) -> Episode:
-        """The record of episode `i` of several."""
+        """Returns the record of episode `i` of several."""
         fact = _Totals(*(x[i].tolist() for x in self))
         loss, mean_q, td_error = (x / fact.updates if fact.updates else math.nan for x in fact.sums)
         max_q = fact.max_q if fact.updates else math.nan
@@ -181,7 +181,7 @@ class _Totals(NamedTuple):
 
 
 class _Loop:
-    """The program itself, as it is traced."""
+    """The program that is traced."""
 
     def __init__(
         self,
@@ -198,12 +198,12 @@ class _Loop:
         self._rows, self._num_appended, self._numbers = rows, num_appended, numbers
 
     def play(self) -> tuple[tf.Tensor, ...]:
-        """The program: -> episodes played, the _Totals of each, the fault."""
+        """Plays the episodes -> number of episodes played, the _Totals of each, the fault."""
         key, first, num_episodes, _, epsilons, recent, solved_reward, *_ = self._numbers
         window = recent.shape[0]
 
         def is_to_go_on(i: tf.Tensor, totals: _Totals, fault: tf.Tensor) -> tf.Tensor:
-            # A little below the bound, so that `train`, which decides, is asked wherever rounding could matter.
+            # `train` decides whether to stop. The bound here is a little lower, in case the two round differently.
             may_be_solved = tf.reduce_mean(totals.reward[i : i + window]) > solved_reward - 1e-6
             return (i < num_episodes) & (fault == 0) & ~((i > 0) & may_be_solved)
 
@@ -220,7 +220,7 @@ class _Loop:
         return played, *totals._replace(reward=totals.reward[window:]), fault
 
     def _play_episode(self, key: tf.Tensor, epsilon: tf.Tensor) -> tuple[_Totals, tf.Tensor]:
-        """-> what it was like, and what was not finite in it, an index of _FAULTS."""
+        """Plays an episode -> its _Totals, and what was not finite in it, as an index of _FAULTS."""
         rng = tf.stack([key, tf.constant(-(2**62), tf.int64)])
         state = self._env.initial(rng)
         observation = self._observation(state, rng)
@@ -235,9 +235,9 @@ class _Loop:
     def _turn(
         self, key: tf.Tensor, epsilon: tf.Tensor, state: Any, is_over: tf.Tensor, totals: _Totals, fault: tf.Tensor
     ) -> tuple[Any, ...]:
-        """The env steps up to the next update, and the update: -> state, is_over, totals, fault."""
+        """Takes the env steps up to the next update, then updates -> state, is_over, totals, fault."""
         n, batch_size, memory_size = self._config.steps_per_update, self._config.batch_size, self._config.memory_size
-        number = (totals.steps + n - 1) // n  # turn 0 is step 0, turn k the n steps up to step k n
+        number = (totals.steps + n - 1) // n  # turn 0 is step 0; turn k is the n steps that end with step k n
         bits = draw_bits(2 * n + batch_size, key, number)
 
         def step(
@@ -279,7 +279,7 @@ class _Loop:
     def _step(
         self, state: Any, epsilon: tf.Tensor, bits: tf.Tensor, action_bits: tf.Tensor, rng: tf.Tensor
     ) -> tuple[tuple, tf.Tensor, tf.Tensor, tf.Tensor]:
-        """One env step, remembered: -> next state, reward, terminated, fault. A state goes with its observation."""
+        """Takes and stores an env step -> next state, reward, terminated, fault. A state comes with its observation."""
         env, first_action = self._env, self._spaces.first_action
         state, observation = state  # [*S]
         greedy = tf.argmax(self._learner.q_network(observation[None])[0], output_type=tf.int32)

@@ -1,4 +1,4 @@
-"""The random draws of compiled episodes: every one follows from the run's seed, the episode and the turn."""
+"""The random draws of compiled episodes. They depend only on the run's seed, the episode and the turn."""
 
 from typing import Any
 
@@ -8,27 +8,27 @@ from dqn_keras._engine.tensorflow import tf
 
 
 def draw_bits(num: int, key: tf.Tensor, counter: Any) -> tf.Tensor:
-    """Random bits, [num] uint32, that follow from two int64 numbers (Philox, Salmon et al. 2011)."""
+    """Returns random bits, [num] uint32, determined by two int64 numbers (Philox, Salmon et al. 2011)."""
     seed = tf.stack([key, tf.cast(counter, tf.int64)])
     return tf.random.stateless_uniform([num], seed, minval=None, maxval=None, dtype=tf.uint32, alg="philox")
 
 
 def to_uniform(bits: tf.Tensor) -> tf.Tensor:
-    """Bits as float32 in [0, 1), in steps of 2^-24."""
+    """Converts bits to float32 in [0, 1), in steps of 2^-24."""
     return tf.cast(tf.bitwise.right_shift(bits, tf.constant(8, tf.uint32)), tf.float32) * 2.0**-24
 
 
 def to_integer(bits: tf.Tensor, bound: Any) -> tf.Tensor:
-    """Bits as int32 in [0, bound); no value is favoured by more than bound / 2^32."""
+    """Converts bits to int32 in [0, bound); the relative error of any probability is at most bound / 2^32."""
     product = tf.cast(bits, tf.uint64) * tf.cast(bound, tf.uint64)
     return tf.cast(tf.bitwise.right_shift(product, tf.constant(32, tf.uint64)), tf.int32)
 
 
 def sample_indices(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any) -> tf.Tensor:
-    """As many different indices in [0, size) as there are bits, uniformly: what is a repeat is drawn again.
+    """Draws as many different indices in [0, size) as there are bits, uniformly: repeats are drawn again.
 
-    An index goes only if an earlier one is equal, and every value is as likely to be hit; so by symmetry all sets of
-    different indices are equally likely.
+    An index is drawn again only if it equals an earlier one. This rule treats all values alike, so by symmetry all sets
+    of different indices are equally likely.
     """
     batch_size = bits.shape[0]
     is_earlier = tf.constant(np.triu(np.ones((batch_size, batch_size), bool), 1))  # [i, j]: i < j
@@ -46,9 +46,9 @@ def sample_indices(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any) -> 
     return tf.while_loop(lambda _, is_repeat, __: tf.reduce_any(is_repeat), redraw, start)[0]
 
 
-_NEXT_ATTEMPT = 2**32  # above every turn's number
+_NEXT_ATTEMPT = 2**32  # larger than the number of any turn
 
 
 def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:
-    """The number that all of an episode's draws follow from, int64."""
+    """Returns the int64 number that determines all draws of an episode."""
     return tf.bitcast(draw_bits(2, key, episode), tf.int64)

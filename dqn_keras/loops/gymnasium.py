@@ -1,8 +1,7 @@
 """Episodes in any gymnasium.Env with Box observations and discrete actions, one step at a time.
 
-Acting runs in NumPy, where the network is one that NumPy can compute, and learning is one compiled call per update: a
-TensorFlow call costs more than a step of CartPole and the forward pass of its network together, so the loop makes as
-few of them as it can.
+A TensorFlow call costs more than a step of CartPole and the forward pass of its network together. Therefore the loop
+makes few of them: acting runs in NumPy if NumPy can compute the network, and each update is one compiled call.
 """
 
 import math
@@ -28,7 +27,7 @@ from dqn_keras.seeding import episode_seed
 def episodes(
     env: CheckedEnv, agent: Agent, config: Config, formulas: Formulas = DEFAULT_FORMULAS
 ) -> Generator[Episode, None, None]:
-    """Play and learn, episode after episode, until the run's last; `agent` is changed in place."""
+    """Plays and learns until the run's last episode, and yields each episode; `agent` is changed in place."""
     kind = _InNumPy if is_relu_mlp(agent.q_network) else _InTensorFlow
     q = kind(agent, config, formulas)
     while len(agent.episodes) < config.num_episodes:
@@ -67,7 +66,7 @@ def _play_episode(env: CheckedEnv, agent: Agent, config: Config, q: "_InNumPy | 
 
 
 class _InNumPy:
-    """Q, computed in NumPy with the weights that the last update has given back."""
+    """Q, computed in NumPy with the weights that the last update returned."""
 
     def __init__(self, agent: Agent, config: Config, formulas: Formulas) -> None:
         self._network = agent.q_network
@@ -77,15 +76,15 @@ class _InNumPy:
         self._step = _bind_step(agent, config, formulas, gives_weights=True)
 
     def read_weights(self) -> None:
-        """Anew at each episode: a callback may have changed them."""
+        """Reads the weights at the start of each episode, since a callback may have changed them."""
         self._weights = self._network.get_weights()
 
     def values(self, state: np.ndarray) -> np.ndarray:
-        """Q(s, .), [A]."""
+        """Returns Q(s, .), [A]."""
         return q_values(self._weights, state)
 
     def update(self, rows: np.ndarray) -> Metrics:
-        """A gradient step on rows of the memory."""
+        """Takes a gradient step on rows of the memory and returns its metrics."""
         flat = self._step(tf.constant(rows))[0].numpy()
         parts = zip(self._ends, self._ends[1:], self._shapes, strict=False)
         self._weights = [flat[i:j].reshape(shape) for i, j, shape in parts]
@@ -93,7 +92,7 @@ class _InNumPy:
 
 
 class _InTensorFlow:
-    """The same for any other network, a TensorFlow call per step."""
+    """Q of any other network, computed with one TensorFlow call per step."""
 
     def __init__(self, agent: Agent, config: Config, formulas: Formulas) -> None:
         def make_values(learner: Learner, _: Any) -> Callable[[tf.Tensor], tf.Tensor]:
@@ -105,23 +104,24 @@ class _InTensorFlow:
         self._step = _bind_step(agent, config, formulas, gives_weights=False)
 
     def read_weights(self) -> None:
-        """They are in the network."""
+        """Does nothing: the weights are in the network."""
 
     def values(self, state: np.ndarray) -> np.ndarray:
-        """Q(s, .), [A]."""
+        """Returns Q(s, .), [A]."""
         return self._values(tf.constant(state))[0].numpy()
 
     def update(self, rows: np.ndarray) -> Metrics:
-        """A gradient step on rows of the memory."""
+        """Takes a gradient step on rows of the memory and returns its metrics."""
         return Metrics(*self._step(tf.constant(rows))[0].numpy().tolist())
 
 
 def _bind_step(
     agent: Agent, config: Config, formulas: Formulas, gives_weights: bool
 ) -> Callable[[tf.Tensor], list[tf.Tensor]]:
-    """The gradient step on rows of the memory -> its metrics and, if asked for, Q's new weights, all in one vector.
+    """Returns the gradient step: rows of the memory -> a vector of its metrics and, if wanted, Q's new weights.
 
-    One array comes out and two go in: each further one costs as much as its share of the arithmetic.
+    The step has only two inputs and one output, because each additional array costs as much as its share of the
+    arithmetic.
     """
     rows, state_shape = agent.memory.rows, agent.memory.state_shape
 

@@ -1,1 +1,1 @@
-"""What is kept on disk: checkpoints, what they are known by, networks."""
+"""Files on disk: checkpoints, the identity of a run, networks."""

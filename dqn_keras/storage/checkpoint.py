@@ -1,7 +1,7 @@
-"""What is kept on disk: the whole state of a run, and the trained network alone.
+"""Checkpoints: the whole state of a run on disk.
 
-A checkpoint is a NumPy archive (.npz, arrays only, nothing is pickled) followed by the SHA-256 of its bytes. It is
-written under another name, flushed to the disk, and only then given its own, so that a crash leaves the last one whole.
+A checkpoint is a NumPy archive (.npz, only arrays, nothing is pickled) followed by the SHA-256 of its bytes. It is
+written under another name, flushed to the disk and only then renamed, so that a crash leaves the last one whole.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ from dqn_keras.storage.versions import warn_of_other_versions
 
 
 class Checkpoints:
-    """The checkpoints of one run in a folder of their own, one file each, of which the last two are kept."""
+    """The checkpoints of one run in their own folder, one file each. Only the last two are kept."""
 
     def __init__(
         self,
@@ -35,14 +35,14 @@ class Checkpoints:
         self.folder = Path(folder)
         self._every, self._saved_at = every, 0
         self._identity, self._other_variables = identity
-        self._kept: list[Path] = []  # the newest first, all known to be whole
+        self._kept: list[Path] = []  # newest first, all known to be whole
 
     def paths(self) -> list[Path]:
-        """The files, the newest first."""
+        """Returns the checkpoint files, newest first."""
         return sorted(self.folder.glob(f"checkpoint-{'[0-9]' * 10}.npz"), reverse=True)
 
     def begin(self, agent: Agent, seed: int | None, resume: bool) -> Path | None:
-        """Brings the agent to where the run is, and has a file there before any work starts; the file it is from."""
+        """Resumes the saved run, or saves a new one before any work starts; returns the file that was read, if any."""
         if not resume and (paths := self.paths()):
             raise ValueError(
                 f"checkpoint {paths[0]} is there already; resume=True continues that run, "
@@ -55,12 +55,12 @@ class Checkpoints:
         return path
 
     def save_when_due(self, agent: Agent) -> None:
-        """Saves if it is `every` episodes since the last time, or more. A disk that refuses is a warning."""
+        """Saves if at least `every` episodes have passed since the last time; warns if the disk cannot be written."""
         if len(agent.episodes) >= self._saved_at + self._every:
             self._save_or_warn(agent)
 
     def save_the_end(self, agent: Agent, has_callbacks: bool) -> None:
-        """Saves what is new since the last time; callbacks may have changed the agent in `on_train_end`."""
+        """Saves if anything may be new since the last time: callbacks may change the agent in `on_train_end`."""
         if has_callbacks or len(agent.episodes) > self._saved_at:
             self._save_or_warn(agent)
 
@@ -75,7 +75,7 @@ class Checkpoints:
             )
 
     def save(self, agent: Agent) -> None:
-        """Save the state of `agent`, which must be at an episode's end; OSError if the disk does not take it."""
+        """Saves the state of `agent` at the end of an episode; raises OSError if the disk cannot be written."""
         path = self.folder / f"checkpoint-{len(agent.episodes):010d}.npz"
         content = to_bytes(_arrays(agent, self._other_variables), {"format": FORMAT, **self._identity, **_facts(agent)})
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -87,11 +87,11 @@ class Checkpoints:
                 other.unlink()
 
     def restore(self, agent: Agent, seed: int | None) -> Path | None:
-        """Put `agent` into the newest state that is whole; None if there is none yet.
+        """Puts `agent` into the newest whole state and returns its file; None if there is no file yet.
 
         Raises:
-            ValueError: the state is of another run (the message begins with what differs, such as a field of Config),
-                or no file is whole.
+            ValueError: the state is from another run (the message begins with what differs, such as a field of Config),
+                it has more episodes than `num_episodes`, or no file is whole.
         """
         damaged = []
         for path in self.paths():
@@ -120,7 +120,7 @@ class Checkpoints:
 
 
 def _arrays(agent: Agent, others: Sequence[tf.Variable]) -> dict[str, Any]:
-    """All that is an array, by name."""
+    """Returns the arrays of the state, by name."""
     columns = {f"episodes/{x}": np.array([getattr(e, x) for e in agent.episodes], t) for x, t in _COLUMNS.items()}
     variables = {name: v.numpy() for name, v in _variables(agent, others).items()}
     return {**columns, "memory": agent.memory.rows[: len(agent.memory)], **variables}
@@ -130,13 +130,13 @@ _COLUMNS: dict[str, Any] = dict.fromkeys(Episode._fields[1:], np.float64) | {"st
 
 
 def _variables(agent: Agent, others: Sequence[tf.Variable]) -> dict[str, keras.Variable | tf.Variable]:
-    """By names that do not depend on those of the layers, which Keras numbers through a process."""
+    """Returns the variables by names without layer names, which Keras numbers across a process."""
     owners = {name: part.variables for name, part in agent.learner._asdict().items()} | {"other": others}
     return {f"{owner}/{i}": variable for owner, variables in owners.items() for i, variable in enumerate(variables)}
 
 
 def _facts(agent: Agent) -> dict[str, Any]:
-    """The rest of the state, which is no array."""
+    """Returns the rest of the state, as JSON values."""
     return {
         "seed": agent.seed,
         "num_episodes": len(agent.episodes),
@@ -148,14 +148,14 @@ def _facts(agent: Agent) -> dict[str, Any]:
 
 
 def check_facts(facts: dict[str, Any], expected: dict[str, Any]) -> None:
-    """They must be all there, and of the right kind."""
+    """Raises DamagedError if one of the expected facts is missing or has another type."""
     for name, value in expected.items():
         if type(facts.get(name)) is not type(value):
             raise DamagedError(f"{name} is missing or wrong in it: {facts.get(name)!r}")
 
 
 def _restore(agent: Agent, others: Sequence[tf.Variable], arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
-    """Put a fresh agent into a saved state; nothing is changed if the state does not fit it."""
+    """Puts a new agent into a saved state; raises DamagedError, before any change, if the state does not fit."""
     num_episodes, num_appended, epsilon = facts["num_episodes"], facts["num_appended"], facts["epsilon"]
     rng = np.random.default_rng(0)
     try:
@@ -165,7 +165,7 @@ def _restore(agent: Agent, others: Sequence[tf.Variable], arrays: dict[str, np.n
     expected = _arrays(agent, others)
     expected |= {f"episodes/{name}": np.zeros(max(0, num_episodes), dtype) for name, dtype in _COLUMNS.items()}
     expected["memory"] = agent.memory.rows[:num_appended]
-    # A run goes on while an average of Adam's overflows, as long as the weights are finite.
+    # A run continues if one of Adam's averages overflows, as long as the weights are finite.
     may_be_infinite = {f"episodes/{name}" for name in Metrics._fields} | {
         name for name in expected if name.startswith(("optimizer/", "other/"))
     }

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written beside their place, and checked by a digest when they are read."""
+"""Files that are either whole or absent: they replace the old file at once, and a digest is checked on reading."""
 
 import contextlib
 import hashlib
@@ -18,11 +18,11 @@ FORMAT = 5
 
 
 class DamagedError(ValueError):
-    """Why a file is no whole checkpoint."""
+    """The reason why a file is not a whole checkpoint."""
 
 
 def to_bytes(arrays: Mapping[str, Any], facts: dict[str, Any]) -> bytes:
-    """The content of a checkpoint file."""
+    """Returns the content of a checkpoint file."""
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
     body = file.getvalue()
@@ -30,7 +30,7 @@ def to_bytes(arrays: Mapping[str, Any], facts: dict[str, Any]) -> bytes:
 
 
 def from_bytes(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The opposite of `to_bytes`; an error that says why, if the content is not as that made it."""
+    """Returns the arrays and facts in `content`; raises DamagedError if it is damaged or has another format."""
     body, digest = content[:-32], content[-32:]
     if hashlib.sha256(body).digest() != digest:
         raise DamagedError("its SHA-256 is not that of its content, so that it has been cut short or changed")
@@ -48,7 +48,7 @@ def from_bytes(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path`, which takes its place at once when the block has ended without an error."""
+    """Yields a temporary path beside `path`; its file replaces `path` at once when the block ends without an error."""
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         yield temporary
@@ -59,7 +59,7 @@ def replacing(path: Path) -> Iterator[Path]:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
-    if os.name == "posix":  # the folder's list of names, too
+    if os.name == "posix":  # flushes the folder's list of names, too
         descriptor = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(descriptor)

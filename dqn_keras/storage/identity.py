@@ -1,4 +1,4 @@
-"""What makes two runs the same run, in words and numbers that a file can hold."""
+"""The identity of a run: what must be equal for two runs to be the same, in a form that a file can hold."""
 
 import dataclasses
 import json
@@ -24,13 +24,13 @@ class Identity(NamedTuple):
     """What must be the same for a saved run to be resumed."""
 
     facts: dict[str, Any]
-    """As a file holds it."""
+    """The identity as JSON values."""
     other_variables: list[tf.Variable]
-    """What the user's parts read or change beside the agent's variables, and so belongs to the state of a run."""
+    """Variables outside the agent that the user's parts read or change. They belong to the state of a run."""
 
 
 def identity_of_study(env: gym.Env | FuncEnv, config: Config) -> dict[str, Any]:
-    """What must be the same for a saved study to be continued; versions may differ."""
+    """Returns what must be the same for a saved study to continue; versions may differ."""
     return _facts(config, env=describe(env)[0])
 
 
@@ -42,18 +42,18 @@ def identity(
     q_network: keras.Model | None = None,
     optimizer: keras.Optimizer | None = None,
 ) -> Identity:
-    """What must be the same for a saved run to be resumed; versions may differ.
+    """Returns what must be the same for a saved run to be resumed; versions may differ.
 
     Args:
         env: the environment.
         config: the parameters.
-        agent: a new one.
-        formulas: its targets and loss.
-        q_network: the user's; None for the default.
-        optimizer: the user's; None for the default.
+        agent: a new agent.
+        formulas: the targets and the loss.
+        q_network: the user's network; None for the default.
+        optimizer: the user's optimizer; None for the default.
 
     Raises:
-        ValueError: a function or class of the user's has no name that can be imported.
+        ValueError: a function or class of the user has no name that can be imported.
     """
     given = {"q_network": q_network, "optimizer": optimizer}
     if not packages(formulas):
@@ -79,7 +79,7 @@ def _facts(config: Config, **parts: Part) -> dict[str, Any]:
 
 
 def _traceable(agent: Agent, config: Config, formulas: Formulas) -> dict[str, tuple[Callable, list[tf.TensorSpec]]]:
-    """By name, a function that computes what the part does, its gradients included, and what it takes."""
+    """Returns, for each part, a function that computes its results and gradients, and the specs of its arguments."""
     q_network, q_hat_network, optimizer = agent.learner
     weights = q_network.trainable_variables
     scalar, vector = tf.TensorSpec(()), tf.TensorSpec((config.batch_size,))
@@ -117,7 +117,7 @@ def _traceable(agent: Agent, config: Config, formulas: Formulas) -> dict[str, tu
 
 
 def check_is_same(path: Path, theirs: dict[str, Any], ours: dict[str, Any], but_for: Sequence[str] = ()) -> None:
-    """ValueError that begins with the argument of `train`, or field of Config, in which `path` is of another run."""
+    """Raises ValueError if `path` is from another run; the message begins with the argument or field that differs."""
     numbers, our_numbers = ({**x["config"], "seed": x.get("seed")} for x in (theirs, ours))
     for name in [name for name in our_numbers if name not in but_for]:
         if name not in numbers or numbers[name] != our_numbers[name]:

@@ -1,4 +1,4 @@
-"""The trained network alone, in Keras' own format."""
+"""Files with only the trained network, in Keras' own format."""
 
 import os
 import zipfile
@@ -13,18 +13,18 @@ from dqn_keras.storage.files import replacing
 
 
 def save_q_network(path: str | os.PathLike, q_network: keras.Model) -> None:
-    """Save the network alone, in Keras' own format; an older file of that name is replaced at once.
+    """Saves only the network, in Keras' own format; an older file of that name is replaced at once.
 
     Raises:
-        ValueError: `path` does not end in .keras; the network has a layer of an unregistered class.
-        OSError: the disk does not take it.
+        ValueError: `path` does not end in .keras, or the network has a layer of an unregistered class.
+        OSError: the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".keras":
         raise ValueError(f"path must end in .keras, got {str(path)!r}")
     try:
         with python_random_kept():
-            network = type(q_network).from_config(q_network.get_config())  # which has no optimizer to save
+            network = type(q_network).from_config(q_network.get_config())  # without the optimizer
     except (TypeError, ValueError) as error:
         raise ValueError(
             "q_network has a layer that no file can name: keras.saving.register_keras_serializable() on its class, and "
@@ -39,18 +39,18 @@ def save_q_network(path: str | os.PathLike, q_network: keras.Model) -> None:
 
 
 def load_q_network(path: str | os.PathLike) -> keras.Model:
-    """The network that `run.save` saved, for `evaluate`, or whatever a Keras model is good for.
+    """Returns the network saved by `run.save`, for `evaluate` or any other use of a Keras model.
 
-    It is Keras' own format, in Keras' safe mode: a file that would run code of its own is refused.
+    The file is read in Keras' safe mode, which refuses a file that would run its own code.
 
     Raises:
-        FileNotFoundError: there is none.
-        ValueError: it is damaged or not a Q-network; the message names the file.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged or does not hold a Q-network; the message names the file.
     """
     path = Path(path)
     try:
         with zipfile.ZipFile(path) as archive:
-            if (broken := archive.testzip()) is not None:  # Keras reads parts, and so checks no sum
+            if (broken := archive.testzip()) is not None:  # Keras reads only parts, and so checks no checksum
                 raise ValueError(f"{broken} in it is damaged")
         network = keras.saving.load_model(path, compile=False, safe_mode=True)
         check_network("it", network)
@@ -58,6 +58,6 @@ def load_q_network(path: str | os.PathLike) -> keras.Model:
             raise ValueError("one of its weights is not finite")
     except FileNotFoundError:
         raise
-    except Exception as error:  # whatever Keras, h5py or zipfile say of bytes that are not theirs
+    except Exception as error:  # Keras, h5py and zipfile raise many kinds of errors for a damaged file
         raise ValueError(f"path {path} is not a network that can be loaded: {error}") from error
     return network

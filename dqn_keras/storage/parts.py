@@ -1,4 +1,4 @@
-"""What a part of a run is called, what the user's code in it says, and what it computes."""
+"""Descriptions of the parts of a run: the name, the source of the user's code, and the computation."""
 
 import functools
 import hashlib
@@ -23,15 +23,15 @@ class Part(NamedTuple):
     """One part of a run: the network, the optimizer, a formula or the environment."""
 
     words: Any
-    """What it is called, with its settings as far as they have names."""
+    """Name and named settings, as JSON values."""
     source: str = ""
-    """A digest of the source of the user's code in it."""
+    """Digest of the source of the user's code in the part."""
     computes: str = ""
-    """A digest of the graph that it is traced to, where it has one: it tells apart all that computes something else."""
+    """Digest of the traced graph, different for parts that compute different things; empty if there is none."""
 
 
 def words_for(part: Any) -> str:
-    """What a network, an optimizer or a formula is called, with the settings that were chosen."""
+    """Returns the name of a network, an optimizer or a formula, with the settings that are not defaults."""
     if part is None:
         return "the default"
     if isinstance(part, str):
@@ -50,28 +50,28 @@ def words_for(part: Any) -> str:
 
 
 def _chosen_settings(part: Any) -> dict[str, Any]:
-    """Those of a Keras object's configuration that are not as by default, as far as it has one."""
+    """Returns the settings of a Keras object that differ from the defaults; empty if it has no configuration."""
     try:
         config, usual = part.get_config(), type(part)().get_config()
-    except Exception:  # whatever a class of the user's says
+    except Exception:  # a user's class can raise anything
         return {}
     chosen = {name: x for name, x in config.items() if name != "name" and x != usual.get(name)}
     return {name: x["class_name"] if isinstance(x, dict) and "class_name" in x else x for name, x in chosen.items()}
 
 
 def source_of(part: Any) -> str:
-    """A digest of the source of the user's functions and classes that a part is made of."""
+    """Returns a digest of the source of the user's functions and classes in a part."""
     sources = []
     for code in _own_code(part, set()):
         try:
             sources.append(inspect.getsource(code))
-        except (OSError, TypeError):  # typed in where no source is kept
+        except (OSError, TypeError):  # typed into a console that keeps no source
             sources.append(code.__qualname__)
     return hashlib.sha256("".join(sources).encode()).hexdigest()[:12] if sources else ""
 
 
 def check_can_be_imported(argument: str, part: Any) -> None:
-    """ValueError if a function or class of the user's has no name that says what it is."""
+    """Raises ValueError if a function or class of the user has no name by which it can be imported."""
     for code in _own_code(part, set()):
         try:
             is_importable = operator.attrgetter(code.__qualname__)(sys.modules[code.__module__]) is code
@@ -86,7 +86,7 @@ def check_can_be_imported(argument: str, part: Any) -> None:
 
 
 def _own_code(part: Any, met: set[int]) -> Iterator[Any]:
-    """The user's functions and classes that a part is made of: itself, its class, and what its attributes hold."""
+    """Yields the user's functions and classes in a part: the part itself, its class, and what its attributes hold."""
     if id(part) in met:
         return
     met.add(id(part))
@@ -107,7 +107,7 @@ def _own_code(part: Any, met: set[int]) -> Iterator[Any]:
     elif hasattr(part, "python_function"):  # a tf.function
         held = [part.python_function]
     elif hasattr(part, "__dict__") and not isinstance(part, keras.Variable):
-        of_keras = is_of_a_library(type(part))  # whose other attributes are its books
+        of_keras = is_of_a_library(type(part))  # the other attributes hold its internal records
         held = [type(part), *(x for x in vars(part).values() if not of_keras or isinstance(x, _MAY_BE_OWN))]
     for x in held:
         yield from _own_code(x, met)
@@ -126,10 +126,10 @@ _MAY_BE_OWN = (
 
 
 def describe(env: gym.Env | FuncEnv) -> tuple[Part, *tuple[Computation, ...]]:
-    """What makes it this environment, as far as can be seen; `render_mode` does not.
+    """Returns what identifies an environment: a Part and, if it is functional, its Computation.
 
-    Of a registered one its id and arguments, of any other the constructor's arguments that it keeps under their names;
-    of a functional one also what it computes.
+    A registered environment is described by its id and arguments, any other by those arguments of its constructor that
+    it keeps as attributes of the same name. `render_mode` is left out.
     """
     wrappers: list[Any] = []
     if isinstance(env, FuncEnv):
@@ -167,7 +167,7 @@ def describe(env: gym.Env | FuncEnv) -> tuple[Part, *tuple[Computation, ...]]:
 
 
 def _plain(value: Any, depth: int = 3) -> Any:
-    """Something that JSON holds, equal for equal values; of what has no plain value, its type."""
+    """Returns a JSON value that is equal for equal values; the name of the type if there is no such value."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | float | str):
@@ -176,7 +176,7 @@ def _plain(value: Any, depth: int = 3) -> Any:
         return {str(key): _plain(x, depth) for key, x in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(x, depth) for x in value]
-    if isinstance(value, set | frozenset):  # whose order differs from process to process
+    if isinstance(value, set | frozenset):  # its order differs between processes
         return sorted((_plain(x, depth) for x in value), key=repr)
     if isinstance(value, functools.partial):
         return [_plain(value.func, depth), _plain(value.args, depth), _plain(value.keywords, depth)]

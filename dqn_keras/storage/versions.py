@@ -1,4 +1,4 @@
-"""The versions and the processor that a result was made with."""
+"""The software versions and the processor that a result was made with."""
 
 import platform
 import re
@@ -14,14 +14,14 @@ from dqn_keras.version import __version__
 
 
 def versions() -> dict[str, str]:
-    """What the last bits of a result may depend on."""
+    """Returns the versions and the processor, on which the last bits of a result may depend."""
     modules = {"tensorflow": tf, "keras": keras, "numpy": np, "gymnasium": gym}
     versions = {name: module.__version__ for name, module in modules.items()}
     return {"dqn_keras": __version__, "python": platform.python_version(), **versions, "processor": _processor()}
 
 
 def _processor() -> str:
-    """Its kind, with the vector instructions where the system tells them."""
+    """Returns the kind of processor, with its vector instructions if the system lists them."""
     try:
         flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     except OSError:
@@ -31,7 +31,7 @@ def _processor() -> str:
 
 
 def warn_of_other_versions(path: Path, theirs: dict[str, Any], ours: dict[str, Any], stacklevel: int) -> None:
-    """One warning of all versions that differ."""
+    """Gives one warning that names all versions that differ."""
     theirs, ours = theirs["versions"], ours["versions"]
     others = [f"{name} {theirs.get(name)} (here {ours[name]})" for name in ours if theirs.get(name) != ours[name]]
     if others:
