@@ -1,4 +1,4 @@
-"""The agent: everything that a run changes, and the record of one of its episodes."""
+"""The agent: everything that a run changes."""
 
 import contextlib
 import dataclasses
@@ -21,7 +21,7 @@ from dqn_keras.seeding import _derived
 
 @dataclasses.dataclass
 class Agent:
-    """What learns, and all that it carries from one episode to the next."""
+    """The networks, and all other state that one episode passes on to the next."""
 
     seed: int
     q_network: keras.Sequential
@@ -29,22 +29,22 @@ class Agent:
     optimizer: keras.Optimizer
     memory: ReplayMemory
     rng: np.random.Generator
-    """The source of every random draw of acting and sampling."""
+    """Source of the random draws for acting and sampling in a gymnasium.Env."""
     epsilon: float
     """Probability of a random action in the next episode."""
     episodes: list["Episode"] = dataclasses.field(default_factory=list)
-    """The record so far; its length is the number of the next episode."""
+    """Records of the episodes so far; the length of the list is the number of the next episode."""
     num_updates: int = 0
-    """Gradient steps taken."""
+    """Number of gradient steps taken."""
 
     @property
     def learner(self) -> Learner:
-        """What a gradient step changes."""
+        """The networks and the optimizer, which a gradient step changes."""
         return Learner(self.q_network, self.q_hat_network, self.optimizer)
 
 
 class DivergedError(ValueError):
-    """The loss or a weight is not finite any more."""
+    """The error for a loss or a weight that is no longer finite."""
 
 
 def make_agent(
@@ -58,11 +58,11 @@ def make_agent(
     some_states: np.ndarray | None = None,
     dtype: Any = np.float32,
 ) -> Agent:
-    """An agent that has seen nothing.
+    """Returns an untrained agent.
 
-    Weights and random stream follow from `seed` alone, but for the weights of a network that is given. That learns
-    with its owner's optimizer if it was compiled, or else is compiled with `loss`. `some_states` [B, *S] are what its
-    copy is compared on.
+    Its weights and its random stream depend on `seed` alone; only a given `q_network` keeps its own weights. A given
+    network that its owner compiled learns with the owner's optimizer, unless `optimizer` is given; one that is not
+    compiled is compiled with `loss`. `some_states` [B, *S] are used to compare it with its copy.
     """
     sizes = (*state_shape, *config.hidden_units, num_actions)
     is_default = q_network is None and optimizer is None and loss == "mse"
@@ -91,7 +91,7 @@ _compiled_with_our_adam: weakref.WeakKeyDictionary[keras.Model, keras.Optimizer]
 
 
 def owners_optimizer(q_network: keras.Model | None) -> keras.Optimizer | None:
-    """The optimizer that the network was compiled with, if somebody chose it; None for none, or for our own Adam."""
+    """Returns the optimizer that the network's owner compiled it with; None if there is none but our own Adam."""
     if q_network is None or not q_network.compiled or q_network.optimizer is _compiled_with_our_adam.get(q_network):
         return None
     return q_network.optimizer
@@ -100,28 +100,28 @@ def owners_optimizer(q_network: keras.Model | None) -> keras.Optimizer | None:
 def _optimizer_for(
     q_network: keras.Model, optimizer: keras.Optimizer | None, loss: str | Callable, config: Config
 ) -> keras.Optimizer:
-    """The given one, or else Adam. A network that its owner has not compiled is compiled with it and with the loss.
+    """Returns the given optimizer, or else Adam; compiles the network with it and `loss`, if its owner has not.
 
-    Keras' callbacks and .keras files look for both there.
+    Keras' callbacks and .keras files take both from the network.
     """
     if optimizer is not None:
         if owners_optimizer(q_network) is None:
             q_network.compile(optimizer=optimizer, loss=loss, auto_scale_loss=False)
         return optimizer
-    # In mixed precision, Keras puts a LossScaleOptimizer around it, as it does for `model.fit`.
+    # In mixed precision, Keras wraps Adam in a LossScaleOptimizer, as it does for `model.fit`.
     q_network.compile(optimizer=keras.optimizers.Adam(learning_rate=config.alpha, name="adam"), loss=loss)
     _compiled_with_our_adam[q_network] = q_network.optimizer
     return q_network.optimizer
 
 
 def keeps_averages(optimizer: keras.Optimizer) -> bool:
-    """Whether it averages the weights, and puts the averages in their place at the end."""
+    """Returns whether the optimizer averages the weights and replaces them by the averages at the end."""
     return getattr(getattr(optimizer, "inner_optimizer", optimizer), "use_ema", False)
 
 
 @contextlib.contextmanager
 def optimizer_shown(agent: Agent) -> Iterator[None]:
-    """Within, callbacks find the agent's optimizer in its network, whatever the owner has compiled it with."""
+    """Sets the agent's optimizer in its network, where callbacks look for it; restores the owner's at the end."""
     network, owners = agent.q_network, agent.q_network.optimizer
     network.optimizer = agent.optimizer
     try:

@@ -1,4 +1,4 @@
-"""Keras callbacks in a run: an episode is to them an epoch of one batch."""
+"""Keras callbacks in a run: each episode is an epoch of one batch."""
 
 import math
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -18,9 +18,9 @@ def with_callbacks(
     callbacks: Sequence[keras.callbacks.Callback],
     before_end: Callable[[], None],
 ) -> Generator[Episode, None, None]:
-    """Yields the same episodes and tells each to the callbacks, until one of them asks to stop.
+    """Yields the same episodes and reports each to the callbacks, until one of them asks to stop.
 
-    TerminateOnNaN asks for it when learning has diverged, which is then no error. `before_end` is called before the
+    If learning diverges, TerminateOnNaN asks to stop, and then there is no error. `before_end` is called before the
     callbacks' `on_train_end`.
     """
     network, log, num_episodes = run.q_network, Log(run.config), run.config.num_episodes
@@ -31,7 +31,7 @@ def with_callbacks(
     listeners.on_train_begin()
     for callback in listeners.callbacks:
         if isinstance(callback, keras.callbacks.CSVLogger):
-            callback.keys = sorted(LOGGED)  # or it adds an empty column val_NAME to each, which costs as much
+            callback.keys = sorted(LOGGED)  # or it adds an empty column val_NAME for each, at the same cost
     try:
         for number in range(len(run.episodes), num_episodes):
             try:
@@ -51,7 +51,7 @@ def with_callbacks(
 def _told(
     episodes: Iterator[Episode], number: int, log: Log, run: "Run", callbacks: Sequence[keras.callbacks.Callback]
 ) -> Episode:
-    """The next episode, and what callbacks hear of it."""
+    """Plays the next episode and reports it to the callbacks."""
 
     def tell(event: str, number: int, logs: dict[str, float]) -> None:
         for callback in callbacks:  # a CallbackList's own methods take 50 us: they look for tensors in the logs

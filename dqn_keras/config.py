@@ -1,4 +1,4 @@
-"""Config: every number of the algorithm, in one place, checked when it is made."""
+"""Config: every number of the algorithm, in one place. Making a Config checks them."""
 
 import dataclasses
 from typing import Any
@@ -12,40 +12,40 @@ from dqn_keras.checks.numbers import check_count, check_counts, check_number
 class Config:
     """The parameters of a run. The defaults are the original notebook's.
 
-    NumPy scalars are taken for Python's. Every field is checked: TypeError for a value of the wrong
-    kind, ValueError for one out of range; the message names the field, the range and the value.
+    NumPy scalars become Python numbers. Every field is checked: a value of the wrong kind raises TypeError, a value
+    out of range raises ValueError. The message names the field, the range and the value.
     """
 
     memory_size: int = 50_000
-    """Transitions the replay memory keeps; the oldest give way."""
+    """Number of transitions in the replay memory; when it is full, a new one replaces the oldest."""
     steps_per_update: int = 4
-    """Environment steps between two updates: an episode learns at its steps 0, 4, 8, ..."""
+    """Environment steps per update; with 4, an episode learns at its steps 0, 4, 8, ..."""
     alpha: float = 0.001
     """Adam's learning rate, in (0, 1]."""
     gamma: float = 0.95
-    """Discount per environment step, in [0, 1]."""
+    """Discount factor per environment step, in [0, 1]."""
     tau: float = 0.01
     """Share of Q that is mixed into Q-hat at each update, in (0, 1]."""
     batch_size: int = 64
-    """Transitions per update; there is no update before the memory holds as many."""
+    """Transitions per update; updates start when the memory holds this many."""
     epsilon: float = 1.0
     """Probability of a random action in the first episode."""
     decay: float = 0.995
-    """Factor on epsilon after each episode, in (0, 1]."""
+    """Factor that multiplies epsilon after each episode, in (0, 1]."""
     epsilon_min: float = 0.1
-    """Where epsilon stops falling, in [0, epsilon]."""
+    """Lowest value of epsilon, in [0, epsilon]."""
     num_episodes: int = 2_000
-    """Episodes after which training ends, solved or not."""
+    """Maximum number of episodes; training ends after them, solved or not."""
     max_steps: int = 1_000
-    """Environment steps after which an episode is left, if the environment has not ended it."""
+    """Maximum number of environment steps per episode."""
     solved_reward: float = 225.0
     """Training stops when the mean reward of the last `solved_window` episodes is above this."""
     solved_window: int = 50
-    """Episodes in that mean; with fewer played, nothing counts as solved."""
+    """Number of episodes in the mean for `solved_reward`; a run with fewer episodes does not count as solved."""
     hidden_units: tuple[int, ...] = (64,)
-    """Units of each hidden layer, all ReLU."""
+    """Number of units of each hidden layer; all layers use ReLU."""
     jit_compile: bool = True
-    """Compile the learn step with XLA. Results are reproducible either way, but differ in the last bits."""
+    """Compile the learning step with XLA. Results are reproducible with and without it, but differ in the last bits."""
 
     def __post_init__(self) -> None:
         for name in ("memory_size", "steps_per_update", "batch_size", "num_episodes", "max_steps", "solved_window"):
@@ -73,4 +73,4 @@ class Config:
             )
 
     def _set(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)  # the dataclass is frozen; this is its making
+        object.__setattr__(self, name, value)  # how a frozen dataclass sets its own fields

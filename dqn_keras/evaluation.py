@@ -1,4 +1,4 @@
-"""Greedy episodes: what the network is worth without exploration."""
+"""Greedy episodes: how good a network is without exploration."""
 
 import gymnasium as gym
 import numpy as np
@@ -14,14 +14,14 @@ from dqn_keras.seeding import checked_seed, evaluation_seed
 def evaluate(
     env: gym.Env, q_network: keras.Model, num_episodes: int = 100, seed: int | None = None, max_steps: int = 1_000
 ) -> np.ndarray:
-    """Play greedily, learn nothing: the undiscounted return of each episode, [num_episodes] float64.
+    """Plays greedily without learning, and returns each episode's undiscounted return, [num_episodes] float64.
 
     Args:
-        env: as for `train`.
-        q_network: states [B, F] -> Q-values [B, A].
-        num_episodes: how many.
-        seed: episode k starts from a state that follows from (seed, k), and from no start of `train`; None draws one.
-        max_steps: steps after which an episode is left, if the environment has not ended it.
+        env: a gymnasium.Env, as for `train`.
+        q_network: a network, states [B, *S] -> Q-values [B, A].
+        num_episodes: number of episodes.
+        seed: a whole number; None draws one. The start of episode k depends on (seed, k) alone; `train` never uses it.
+        max_steps: maximum number of environment steps per episode.
 
     Raises:
         TypeError, ValueError: as for `train`; or the network does not fit the environment.

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request to stop at a good moment, instead of an exception at any."""
+"""Ctrl-C and SIGTERM as requests to stop at a safe point, instead of exceptions at any point."""
 
 import contextlib
 import signal
@@ -9,10 +9,10 @@ from typing import Any
 
 @contextlib.contextmanager
 def stop_requests() -> Iterator[Callable[[], bool]]:
-    """A function that tells whether Ctrl-C or SIGTERM came since; a second one raises KeyboardInterrupt at once.
+    """Yields a function that returns whether Ctrl-C or SIGTERM has come. A second one raises KeyboardInterrupt at once.
 
-    An interrupted notebook cell is a Ctrl-C. Handlers that someone else has set stay; in a thread other than the
-    main one, which Python sends no signals to, nothing ever comes.
+    Interrupting a notebook cell is a Ctrl-C. Handlers that other code has set stay in place. Python handles signals in
+    the main thread alone, so in another thread the function always returns False.
     """
     requests: list[int] = []
 

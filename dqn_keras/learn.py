@@ -1,7 +1,7 @@
 """The heart of DQN: the targets, the loss, the gradient step on Q, and the soft update of Q-hat.
 
-Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015), algorithm 1; the soft update
-is from Lillicrap et al., "Continuous control with deep reinforcement learning" (2015), algorithm 1.
+DQN is from Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015), algorithm 1. The
+soft update is from Lillicrap et al., "Continuous control with deep reinforcement learning" (2015), algorithm 1.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,15 +26,15 @@ def td_targets(experiences: Experience, gamma: Any, q_network: keras.Model, q_ha
     Args:
         experiences: states [B, *S], actions [B] (whole numbers), rewards [B], next_states [B, *S],
             terminal_states [B] (1 or 0); NumPy arrays or tensors.
-        gamma: discount per step, in [0, 1].
+        gamma: discount factor per step, in [0, 1].
         q_network: states [B, *S] -> Q-values [B, A]; a built Sequential or functional model. Not used here.
-        q_hat_network: the same for the targets.
+        q_hat_network: a network of the same form, which gives Q_hat.
 
     Returns:
-        [B] float32.
+        The targets y, [B] float32.
 
     Raises:
-        TypeError, ValueError: a field's shape, dtype or value is wrong; the message names the field.
+        TypeError, ValueError: the shape, dtype or value of a field is wrong; the message names the field.
     """
     _, _, rewards, next_states, terminal_states = experiences
     max_q_hat = tf.reduce_max(q_hat_network(next_states), axis=-1)  # [B]
@@ -47,9 +47,9 @@ def double_td_targets(
 ) -> tf.Tensor:
     """Returns the targets of Double DQN: Q chooses the next action, Q-hat values it.
 
-    y = r + gamma Q_hat(s', argmax_a' Q(s', a')), or y = r where s' is terminal. This lessens the overestimation that
-    comes from a maximum over noisy values (van Hasselt, Guez and Silver 2016, "Deep Reinforcement Learning with Double
-    Q-learning", equation 4). Arguments, result and errors are those of `td_targets`.
+    y = r + gamma Q_hat(s', argmax_a' Q(s', a')), or y = r where s' is terminal. This reduces the overestimation that a
+    maximum over noisy values causes (van Hasselt, Guez and Silver 2016, "Deep Reinforcement Learning with Double
+    Q-learning", equation 4). Arguments, result and errors are as in `td_targets`.
     """
     _, _, rewards, next_states, terminal_states = experiences
     best_actions = tf.argmax(q_network(next_states), axis=-1)  # [B]
@@ -61,7 +61,7 @@ def double_td_targets(
 def loss_values(experiences: Experience, gamma: Any, q_network: keras.Model, q_hat_network: keras.Model) -> tf.Tensor:
     """Returns the original's loss of a batch, a scalar: the mean squared TD error, mean of (y - Q(s, a))^2.
 
-    Arguments and errors are those of `td_targets`, which gives y.
+    `td_targets` gives y; arguments and errors are the same as its own.
     """
     y_targets = td_targets(experiences, gamma, q_network, q_hat_network)  # [B]
     q_values = tf.gather(q_network(experiences.state), experiences.action, batch_dims=1)  # [B]
@@ -72,7 +72,7 @@ def update_q_hat(q_network: keras.Model, q_hat_network: keras.Model, tau: Any = 
     """Moves Q-hat's weights a little towards Q's: theta_hat <- tau theta + (1 - tau) theta_hat."""
     tau = as_share("tau", tau)
     for q_weights, q_hat_weights in zip(q_network.weights, q_hat_network.weights, strict=True):
-        is_float = tf.as_dtype(q_weights.dtype).is_floating  # a counter or the like is copied
+        is_float = tf.as_dtype(q_weights.dtype).is_floating  # integers, such as a counter, are copied
         q_hat_weights.assign(tau * q_weights + (1 - tau) * q_hat_weights if is_float else q_weights)
 
 
@@ -80,22 +80,22 @@ DEFAULT_FORMULAS = Formulas(td_targets, "mse")
 
 
 def packages(formulas: Formulas) -> Formulas | None:
-    """The formulas if they are this package's and Keras', which do not change while a process lives; else None."""
+    """Returns the formulas if they are this package's and Keras', which never change in a process; else None."""
     are_known = any(formulas.targets is x for x in (td_targets, double_td_targets)) and isinstance(formulas.loss, str)
     return formulas if are_known else None
 
 
 class Metrics(NamedTuple):
-    """What an update's batch was like, before the update; float32 scalars."""
+    """Measurements on the batch of an update, made before the update; float32 scalars."""
 
     loss: Any
-    """With the regularization losses of the network."""
+    """Loss of the batch, including the network's regularization losses."""
     mean_q: Any
     """Mean over the batch of max_a Q(s, a), the metric of Mnih et al. 2013."""
     max_q: Any
-    """The highest of them."""
+    """Maximum over the batch of max_a Q(s, a)."""
     td_error: Any
-    """Mean of |y - Q(s, a)|, with the targets in use."""
+    """Mean over the batch of |y - Q(s, a)|, with the targets in use."""
 
 
 def gradient_step(
@@ -107,7 +107,7 @@ def gradient_step(
     tau: Any,
     formulas: Formulas = DEFAULT_FORMULAS,
 ) -> Metrics:
-    """Takes one gradient step of the loss with respect to Q alone, then moves Q-hat towards Q."""
+    """Takes one gradient step on the loss, with respect to Q alone, then moves Q-hat towards Q."""
     y = formulas.y(experiences, gamma, q_network, q_hat_network)  # [B]
     with tf.GradientTape() as tape:
         q_values = q_network(experiences.state)  # [B, A]
@@ -141,36 +141,36 @@ def learn(
 ) -> tf.Tensor:
     """Learns from one batch: a gradient step on Q and a soft update of Q-hat, compiled into one call.
 
-    Networks, optimizer, targets and loss are used as the objects they are. The call is compiled once for these objects
-    and each size of the batch, and again when one of them has been changed (an attribute, a closure, a global name that
-    a function reads). Networks of `make_networks` with a plain Adam share what is compiled.
+    `learn` uses the networks, optimizer, targets and loss that you pass, not copies of them. It compiles the call once
+    for these objects and each batch size, and again if you change one of them (an attribute, a closure, a global name
+    that a function reads). Networks of `make_networks` with a plain Adam share compiled programs.
 
     Args:
         experiences: an Experience, or any five arrays in its order: states [B, *S], actions [B] (whole numbers),
             rewards [B], next_states [B, *S], terminal_states [B] (1 or 0).
-        gamma: discount per step, in [0, 1].
+        gamma: discount factor per step, in [0, 1].
         q_network: a built Sequential or functional model, states [B, *S] -> Q-values [B, A] float32; changed in place.
             Its layers are called in inference mode, and its regularization losses are added to the loss.
-        q_hat_network: a second one with weights of the same shapes; changed in place.
-        optimizer: any Keras optimizer; built here if it is not.
+        q_hat_network: a second network with weights of the same shapes; changed in place.
+        optimizer: any Keras optimizer; it is built here if necessary.
         tau: share of Q in the soft update, in [0, 1].
         targets: a function like `td_targets`: (experiences, gamma, q_network, q_hat_network) -> y [B]. No gradient
             flows through it.
-        loss: what Keras takes in `compile`: a name, a `keras.losses.Loss`, or a function of (y, q), both [B] -> a
-            scalar or [B], which is averaged.
-        jit_compile: compile with XLA (faster; its results differ from TensorFlow's own in the last bits).
+        loss: any loss that Keras takes in `compile`: a name, a `keras.losses.Loss`, or a function of (y, q), both [B].
+            The function returns a scalar, or [B], which is averaged.
+        jit_compile: compile with XLA, which is faster. Its results differ from TensorFlow's own in the last bits.
 
     Returns:
         The loss of the batch before the step, a scalar float32 tensor.
 
     Raises:
-        TypeError, ValueError: a wrong shape or dtype, an action that is not one, a number that is not finite,
-            networks that do not match; nothing is changed then.
+        TypeError, ValueError: a shape or dtype is wrong, an action does not exist, a number is not finite, or the
+            networks do not match. Nothing has changed then.
     """
     check_network("q_network", q_network)
     check_network("q_hat_network", q_hat_network)
     learner, formulas = Learner(q_network, q_hat_network, optimizer), Formulas(targets, loss)
-    if not tf.executing_eagerly():  # in a tf.function of the caller's, which then compiles it
+    if not tf.executing_eagerly():  # inside the caller's tf.function, which compiles it
         formulas.check()
         with tf.init_scope():
             learner.prepare()
@@ -183,7 +183,7 @@ def learn(
 
 
 def _make_step(formulas: Formulas, learner: Learner) -> Callable[..., tf.Tensor]:
-    """`gradient_step` as a function of tensors alone: the five of a batch, gamma, tau -> the loss."""
+    """Returns `gradient_step` as a function of tensors alone: the five of a batch, gamma, tau -> the loss."""
 
     def step(*tensors: tf.Tensor) -> tf.Tensor:
         *batch, gamma, tau = tensors

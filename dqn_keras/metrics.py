@@ -1,4 +1,4 @@
-"""The agent: everything that a run changes, and the record of one of its episodes."""
+"""Metrics: the record of an episode, and the values that are logged."""
 
 import math
 from collections import deque
@@ -14,38 +14,38 @@ from dqn_keras.replay import Experience
 
 
 class Episode(NamedTuple):
-    """What happened in one episode."""
+    """The record of one episode."""
 
     number: int
-    """Counted from 0."""
+    """Number of the episode, from 0."""
     reward: float
-    """Sum of its rewards, undiscounted."""
+    """Undiscounted sum of its rewards."""
     steps: int
     epsilon: float
-    """With which it was played."""
+    """Probability of a random action in it."""
     loss: float
-    """Mean over its updates, as are the next three but for max_q; NaN if it had none."""
+    """Mean loss over its updates. This and the next three are NaN if it had no updates."""
     mean_q: float
-    """Mean over a batch of max_a Q(s, a)."""
+    """Mean over its batches of max_a Q(s, a)."""
     max_q: float
-    """The highest Q-value in any of its batches."""
+    """Highest Q-value in its batches."""
     td_error: float
-    """Mean over a batch of |y - Q(s, a)|."""
+    """Mean over its batches of |y - Q(s, a)|."""
     max_reward: float
-    """The highest of one step."""
+    """Highest reward of a single step."""
     terminated: bool
-    """Whether the environment ended it, not time."""
+    """Whether the environment terminated it; False after a time limit."""
 
 
 def checked_step(experiences: Experience, learner: Learner, gamma: Any, tau: Any, formulas: Formulas) -> Metrics:
-    """`gradient_step`, its loss NaN if the update has left a weight that is not finite."""
+    """Takes a `gradient_step` and returns its metrics, with a loss of NaN if a weight is no longer finite."""
     metrics = gradient_step(experiences, gamma, *learner, tau, formulas)
     loss = tf.where(is_all_finite(*learner.q_network.weights), metrics.loss, math.nan)
     return metrics._replace(loss=loss)
 
 
 def sum_up(metrics: Sequence[Metrics]) -> Metrics:
-    """Of an episode's updates: the means, and the highest max_q; NaN if there are none."""
+    """Returns the means over an episode's updates, and the highest max_q; NaN if there are no updates."""
     if not metrics:
         return Metrics(*[math.nan] * len(Metrics._fields))
     loss, mean_q, max_q, td_error = zip(*metrics, strict=True)
@@ -54,42 +54,42 @@ def sum_up(metrics: Sequence[Metrics]) -> Metrics:
 
 
 LOGGED = {
-    "reward": "Sum of the episode's rewards, undiscounted.",
-    "average_reward": "Mean over the last `solved_window` episodes, over fewer at the start.",
-    "steps": "Environment steps.",
-    "epsilon": "With which it was played.",
-    "loss": "Mean over the episode's updates, as are mean_q and td_error; NaN before the first.",
-    "mean_q": "Mean over a batch of max_a Q(s, a).",
-    "max_q": "The highest of them in any of the episode's batches.",
-    "q_bound": "What no return can exceed, by the rewards seen so far: the highest, r_max, at every step, "
-    "r_max / (1 - gamma); or, where even r_max is negative, r_max once and then the end.",
-    "td_error": "Mean over a batch of |y - Q(s, a)|.",
-    "terminal_share": "Of the transitions in the memory.",
-    "steps_per_second": "Environment steps, learning included; NaN if the episode was played before a resume.",
+    "reward": "Undiscounted sum of the episode's rewards.",
+    "average_reward": "Mean reward of the last `solved_window` episodes; of fewer at the start.",
+    "steps": "Number of environment steps.",
+    "epsilon": "Probability of a random action.",
+    "loss": "Mean loss over the episode's updates. It, mean_q, max_q and td_error are NaN before the first update.",
+    "mean_q": "Mean over the episode's batches of max_a Q(s, a).",
+    "max_q": "Highest Q-value in the episode's batches.",
+    "q_bound": "Highest possible return if no reward exceeds the highest so far, r_max: r_max / (1 - gamma), for r_max "
+    "at every step. If r_max is negative, it is r_max, for one step and then the end.",
+    "td_error": "Mean over the episode's batches of |y - Q(s, a)|.",
+    "terminal_share": "Share of terminal transitions in the memory.",
+    "steps_per_second": "Environment steps per second, learning included; NaN for episodes from before a resume.",
 }
-"""What callbacks are told of an episode, and `run.history` holds."""
+"""The values that are logged for each episode: callbacks get them, and `run.history` holds them."""
 
 
 class Log:
-    """The record of a run, episode by episode, as Keras' callbacks are told of it."""
+    """The logged values of a run, computed episode by episode."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self._rewards: deque[float] = deque(maxlen=config.solved_window)
         self._memory: deque[tuple[int, bool]] = deque()
-        """Of every episode that the memory holds transitions of: steps, and whether it terminated."""
+        """Steps of each episode that has transitions in the memory, and whether it terminated."""
         self._steps = self._terminated = 0
         self._max_reward = -math.inf
 
     def add(self, episode: Episode, steps_per_second: float) -> dict[str, float]:
-        """What is known at the end of the next episode."""
+        """Adds the next episode and returns its logged values."""
         config = self._config
         self._rewards.append(episode.reward)
         self._max_reward = max(self._max_reward, episode.max_reward)
         self._memory.append((episode.steps, episode.terminated))
         self._steps += episode.steps
         self._terminated += episode.terminated
-        while self._steps - self._memory[0][0] >= config.memory_size:  # none of the oldest's is left
+        while self._steps - self._memory[0][0] >= config.memory_size:  # the oldest has none left
             steps, terminated = self._memory.popleft()
             self._steps -= steps
             self._terminated -= terminated
@@ -115,13 +115,13 @@ def _highest_return(max_reward: float, gamma: float) -> float:
 
 
 def history(episodes: Sequence[Episode], config: Config, steps_per_second: Sequence[float]) -> dict[str, list[float]]:
-    """What `Log` tells of these episodes, name by name, as Keras' `History.history`."""
+    """Returns the logged values of these episodes, one list for each name, like Keras' `History.history`."""
     log = Log(config)
     rows = [log.add(*x) for x in zip(episodes, steps_per_second, strict=True)]
     return {name: [row[name] for row in rows] for name in LOGGED}
 
 
 def is_all_finite(*tensors: tf.Tensor) -> tf.Tensor:
-    """A boolean scalar. Whole numbers are."""
+    """Returns whether all numbers are finite, as a boolean scalar; integers always are."""
     floats = [x for x in map(tf.convert_to_tensor, tensors) if x.dtype.is_floating]
     return tf.reduce_all([tf.reduce_all(tf.math.is_finite(x)) for x in floats])

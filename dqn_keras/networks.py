@@ -1,4 +1,4 @@
-"""The two networks: Q, which learns, and Q-hat, its slow copy that the targets are computed from."""
+"""The two networks: Q, which learns, and Q-hat, its slow copy, which gives the targets."""
 
 from collections.abc import Sequence
 
@@ -16,10 +16,10 @@ def make_q_network(
     seed: int | np.random.SeedSequence | None = None,
     name: str = "q_network",
 ) -> keras.Sequential:
-    """A feed-forward Q-network: states [B, num_features] -> Q-values [B, num_actions], float32.
+    """Returns a feed-forward Q-network: states [B, num_features] -> Q-values [B, num_actions], float32.
 
-    Hidden layers are ReLU, the output is linear. Kernels start Glorot uniform (Keras' default), drawn
-    from `seed` without touching any global random state; biases start at zero.
+    Hidden layers use ReLU; the output is linear. Kernels start Glorot uniform (Keras' default), drawn from `seed`
+    without touching any global random state. Biases start at zero.
     """
     num_features, num_actions = check_count("num_features", num_features), check_count("num_actions", num_actions)
     hidden_units = check_counts("hidden_units", hidden_units)
@@ -38,13 +38,13 @@ def _dense(units: int, activation: str, initializer: keras.initializers.Initiali
 
 
 def _initializers(num_layers: int, seed: int | np.random.SeedSequence | None) -> list[keras.initializers.Initializer]:
-    """Of the kernels, first to last."""
+    """Returns the initializer of each layer's kernel, from the first layer to the last."""
     seeds = np.random.default_rng(seed).integers(2**31, size=num_layers)
     return [keras.initializers.GlorotUniform(seed=int(s)) for s in seeds]
 
 
 def renew_weights(network: keras.Sequential, seed: int | np.random.SeedSequence | None) -> None:
-    """Give a network of `make_q_network` the weights that it would be made with."""
+    """Sets a network of `make_q_network` to the weights that a new one for `seed` has."""
     weights = []
     for layer, initializer in zip(network.layers, _initializers(len(network.layers), seed), strict=True):
         weights += [initializer(layer.kernel.shape), np.zeros(layer.units, np.float32)]
@@ -57,7 +57,7 @@ def make_networks(
     hidden_units: Sequence[int] = (64,),
     seed: int | np.random.SeedSequence | None = None,
 ) -> tuple[keras.Sequential, keras.Sequential]:
-    """Q and Q-hat, of one shape and with equal weights."""
+    """Returns Q and Q-hat: two networks of the same shape, with equal weights."""
     q_network = make_q_network(num_features, num_actions, hidden_units, seed)
     q_hat_network = make_q_network(num_features, num_actions, hidden_units, seed, name="q_hat_network")
     q_hat_network.set_weights(q_network.get_weights())

@@ -1,4 +1,4 @@
-"""Learning curves: of one run, with what was measured on the way, and of many."""
+"""Learning curves: of one run, together with its other logged values, and of many runs."""
 
 from collections.abc import Mapping, Sequence
 
@@ -13,12 +13,12 @@ from dqn_keras.training import Run
 
 
 def plot_rewards(rewards: Sequence[float] | np.ndarray, ax: Axes | None = None, window: int = 20) -> Axes:
-    """Each episode's reward, and the mean over the last `window` episodes once there are as many.
+    """Plots each episode's reward, and the mean of the last `window` episodes, starting when there are that many.
 
     Args:
-        rewards: [num_episodes], as `run.rewards`.
-        ax: where to draw; by default a new figure of 10 by 5 inches.
-        window: episodes in the moving average.
+        rewards: one reward for each episode, [num_episodes], such as `run.rewards`.
+        ax: the Axes to draw in; by default those of a new figure, 10 by 5 inches.
+        window: number of episodes in the moving average.
     """
     window = check_count("window", window)
     rewards = np.asarray(rewards, np.float64)
@@ -39,20 +39,20 @@ def plot_rewards(rewards: Sequence[float] | np.ndarray, ax: Axes | None = None, 
 
 
 def plot_run(run: Run, speed: bool = True) -> np.ndarray:
-    """A run at a glance: its rewards, and under them Q-values, TD error, terminal transitions and speed.
+    """Plots a run at a glance: its rewards, and below them Q-values, TD error, terminal transitions and speed.
 
-    Q-values above their bound say that they are overestimated; what else to look for is in the documentation, "It does
-    not learn". Returns the Axes in that order; `plot_run(run)[0].figure` is the figure, 10 inches wide.
+    Q-values above their bound are overestimated. The documentation says what else to look for, in "It does not learn".
+    Returns the Axes in the order above; `plot_run(run)[0].figure` is the figure, 10 inches wide.
 
     Args:
-        run: of `train`.
-        speed: show the steps per second, the one thing in it that is not the same each time.
+        run: the result of `train`.
+        speed: also plot the steps per second, the only curve that differs between two runs of the same seed.
     """
     return plot_history(run.history, run.config, speed)
 
 
 def plot_history(history: Mapping[str, Sequence[float]], config: Config, speed: bool = True) -> np.ndarray:
-    """The same from `run.history` alone, or from the columns of a log file."""
+    """Plots a run as `plot_run` does, from `run.history` alone or from the columns of a log file."""
     columns = {name: np.asarray(values, np.float64) for name, values in history.items()}
     num_rows, num_columns = (2, 2) if speed else (1, 3)
     figure = plt.figure(figsize=(10, 3.5 + 2.75 * num_rows), layout="constrained")
@@ -79,19 +79,20 @@ def plot_history(history: Mapping[str, Sequence[float]], config: Config, speed: 
         ax.grid(alpha=0.3)
     for ax in panels[-num_columns:]:
         ax.set_xlabel("Episode")
-    rewards.locator_params(axis="x", nbins=6)  # of all: they share it
+    rewards.locator_params(axis="x", nbins=6)  # for all panels, which share the x-axis
     return np.array([rewards, *panels])
 
 
 def plot_study(
     study: Study, axes: Sequence[Axes] | np.ndarray | None = None, published: float | None = 293
 ) -> np.ndarray:
-    """Three pictures of many seeds: how they learn, when they are solved, and how many are, by when.
+    """Plots many seeds in three pictures: the learning curves, the episodes to solved, the share solved by episode.
 
     Args:
-        study: of any number of seeds.
-        axes: the three to draw in; by default a new figure of 15 by 4.5 inches.
-        published: an episode to mark as what one run was reported to need, as the original's 293; None marks nothing.
+        study: a study with any number of seeds.
+        axes: the three Axes to draw in; by default those of a new figure, 15 by 4.5 inches.
+        published: an episode to mark: how many one published run needed, such as the original's 293. None marks
+            nothing.
     """
     if not study.outcomes or study.config.num_episodes < study.config.solved_window:
         raise ValueError(f"study must have seeds with at least solved_window episodes each, got {study}")
@@ -101,13 +102,13 @@ def plot_study(
     window, config = study.config.solved_window, study.config
     solved = np.sort(study.solved_at[np.isfinite(study.solved_at)])
     num_seeds, num_unsolved = len(study.outcomes), len(study.outcomes) - len(solved)
-    until = int(1.5 * np.quantile(study.episodes_to_solved, 0.9)) + 1  # the curves of the rest go on beyond
+    until = int(1.5 * np.quantile(study.episodes_to_solved, 0.9)) + 1  # the slowest curves are cut off here
 
     means = np.full((num_seeds, study.rewards.shape[1]), np.nan)  # of the last `window` episodes
     for row, outcome in zip(means, study.outcomes, strict=True):
         mean = np.convolve(outcome.rewards, np.full(window, 1 / window), mode="valid")
         row[window - 1 : len(outcome.rewards)] = mean
-        row[len(outcome.rewards) :] = mean[-1]  # a run that has ended stays where it was
+        row[len(outcome.rewards) :] = mean[-1]  # after its end, a run keeps its last mean
     means = means[:, :until]
     faint = curves.plot(means.T, color="0.5", alpha=max(0.02, min(1, 10 / num_seeds)), linewidth=0.7)
     faint[0].set_label("each seed")

@@ -1,4 +1,4 @@
-"""The epsilon-greedy policy, and how epsilon falls from episode to episode."""
+"""The epsilon-greedy policy, and the decay of epsilon from episode to episode."""
 
 import numpy as np
 
@@ -6,15 +6,15 @@ from dqn_keras.config import Config
 
 
 def action(q_values: np.ndarray, epsilon: float, rng: np.random.Generator) -> int:
-    """A random action with probability `epsilon`, else one of the highest Q-value.
+    """Chooses a random action with probability `epsilon`, else the action with the highest Q-value.
 
     Args:
         q_values: Q(s, .) of one state, [A] or [1, A]; an array or a tensor.
-        epsilon: in [0, 1].
-        rng: drawn from once, `random()`, and if that explores once more, `integers(A)`.
+        epsilon: probability of a random action, in [0, 1].
+        rng: the random generator. One draw, `random()`, decides; a random action takes a second draw, `integers(A)`.
 
     Returns:
-        The action's index, 0 <= a < A; of equal Q-values the first.
+        The action's index, 0 <= a < A. If several Q-values are highest, it is the first of them.
     """
     if q_values.shape[:-1] not in ((), (1,)):
         raise ValueError(f"q_values must be those of one state, [A] or [1, A], got shape {q_values.shape}")
@@ -24,5 +24,5 @@ def action(q_values: np.ndarray, epsilon: float, rng: np.random.Generator) -> in
 
 
 def decay_epsilon(epsilon: float, config: Config) -> float:
-    """Epsilon for the next episode: `decay` times this one's, but not below `epsilon_min`."""
+    """Returns epsilon for the next episode: `epsilon` times `decay`, but not below `epsilon_min`."""
     return max(epsilon * config.decay, config.epsilon_min)

@@ -1,4 +1,4 @@
-"""What a run prints, and its progress bar, in a terminal or in a notebook."""
+"""The printed lines and the progress bar of a run, in a terminal or in a notebook."""
 
 import warnings
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ __all__ = ["Progress", "tqdm"]
 
 
 class Progress:
-    """The lines that the original prints, and from `verbose` 2 on a bar beside them."""
+    """The lines that the original prints; with `verbose` 2, also a progress bar."""
 
     def __init__(self, run: "Run", verbose: int) -> None:
         self._run, self._verbose = run, verbose
@@ -33,7 +33,7 @@ class Progress:
         self._bar.close()
 
     def show(self, episode: Episode) -> None:
-        """Moves the bar; every 100 episodes a line with the last reward and the average of the last 100."""
+        """Moves the bar; every 100 episodes, also prints the last reward and the average of the last 100."""
         self._bar.update()
         if self._verbose and episode.number % 100 == 0:
             last = [e.reward for e in self._run.episodes[max(0, episode.number - 99) : episode.number + 1]]
@@ -42,7 +42,7 @@ class Progress:
             say(f"Episode {episode.number}, Reward: {episode.reward}, Last 100 Average: {average}")
 
     def show_end(self, folder: object | None) -> None:
-        """Whether the run is solved, or was interrupted, and where it is kept."""
+        """Prints whether the run is solved, or was interrupted and where it is kept."""
         run = self._run
         if self._verbose and run.solved_at is not None:
             average = round(float(np.mean(run.rewards[-run.config.solved_window :])), 2)

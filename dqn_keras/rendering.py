@@ -1,4 +1,4 @@
-"""Frames of an episode, and the moving picture they make: no window, no display, no video encoder."""
+"""Frames of an episode, and an animation made of them: without a window, a display or a video encoder."""
 
 import io
 from collections.abc import Sequence
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 def record_episode(
     env: gym.Env, q_network: keras.Model, seed: int | None = None, max_steps: int = 1_000
 ) -> list[np.ndarray]:
-    """Play one greedy episode: a frame [H, W, 3] uint8 of every state, the first and the last included.
+    """Plays one greedy episode and returns a frame [H, W, 3] uint8 of every state, including the first and the last.
 
     It is the first episode of `evaluate(env, q_network, seed=seed)`. The environment must be made with
-    `render_mode="rgb_array"`, which needs no display; ValueError otherwise.
+    `render_mode="rgb_array"`, which needs no display; otherwise ValueError is raised.
     """
     checked_env = CheckedEnv(env)
     check_fits(q_network, checked_env.spaces.state_shape, checked_env.spaces.num_actions)
@@ -50,14 +50,14 @@ def save_animation(
     width: int = 300,
     format: str | None = None,
 ) -> None:
-    """Write frames as one moving picture that loops, every second frame left out, `fps` frames a second in all.
+    """Saves every second frame as an animation that loops and plays at the speed of the episode.
 
     Args:
-        frames: [H, W, 3] uint8 each.
-        file: path or open binary file.
-        fps: frames per second of the episode (CartPole's is 50).
-        width: pixels; the height follows.
-        format: "PNG" or "GIF"; by default what the suffix of the path says.
+        frames: the frames of an episode, each [H, W, 3] uint8.
+        file: a path or an open binary file.
+        fps: frames per second of the episode (50 for CartPole).
+        width: width in pixels; the height follows from it.
+        format: "PNG" or "GIF"; by default, the suffix of the path decides.
     """
     if not len(frames):
         raise ValueError("frames must hold at least one frame, got none")
@@ -68,7 +68,7 @@ def save_animation(
     height, full_width = frames[0].shape[:2]
     size = (width, round(height * width / full_width))
     images = [Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS) for frame in frames[::2]]
-    # One palette for all, from eight of them, so that frames differ only where things move.
+    # One palette for all frames, made from about eight of them, so that frames differ only where something moves.
     palette = Image.fromarray(np.concatenate([np.asarray(x) for x in images[:: max(1, len(images) // 8)]])).quantize(
         colors=32
     )
@@ -77,9 +77,9 @@ def save_animation(
 
 
 def animate(frames: Sequence[np.ndarray], fps: int = 50, width: int = 300) -> "IPython.display.Image":
-    """The moving picture as a notebook shows it: an animated PNG, kept in the .ipynb, that any browser plays."""
+    """Returns the animation for a notebook: an animated PNG, stored in the .ipynb, that any browser plays."""
     try:
-        from IPython.display import Image as InlineImage  # only a notebook has need of it
+        from IPython.display import Image as InlineImage  # only notebooks need it
     except ImportError as error:
         raise ImportError('animate needs IPython: pip install "dqn_keras[notebooks]"') from error
     buffer = io.BytesIO()

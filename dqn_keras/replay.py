@@ -1,7 +1,7 @@
 """The replay memory: the last transitions, from which every update draws a random batch.
 
-Successive transitions are strongly correlated, and a gradient step wants independent samples; a memory to
-draw from at random gives those, and lets one transition be learned from more than once (Mnih et al. 2015).
+Successive transitions are strongly correlated, but a gradient step needs independent samples. Random draws from a
+memory break the correlation, and a transition can be used in more than one update (Mnih et al. 2015).
 """
 
 import math
@@ -14,29 +14,29 @@ from dqn_keras.checks.numbers import check_count, check_counts
 
 
 class Experience(NamedTuple):
-    """One transition, or, with a leading axis B in every field, a batch of them.
+    """One transition, or a batch of transitions with a leading axis B in every field.
 
-    `terminal_state` says that the environment *terminated*: nothing follows, so nothing is bootstrapped.
-    A time limit (`truncated`) also ends an episode, but the state it ends in has a future, and is not marked.
+    `terminal_state` is 1 if the environment *terminated*: no state follows, so there is no bootstrapping. A time limit
+    (`truncated`) also ends an episode, but its last state has a future, so `terminal_state` is 0.
     """
 
-    state: Any  # [*S] float32, or uint8 as images are
+    state: Any  # [*S] float32, or uint8 for images
     action: Any  # int32, an index: 0 <= action < A
     reward: Any  # float32
-    next_state: Any  # [*S], as state
+    next_state: Any  # [*S], same dtype as state
     terminal_state: Any  # float32, 1 or 0
 
 
 class ReplayMemory:
-    """The last `memory_size` transitions, in a ring that is allocated once.
+    """The last `memory_size` transitions, in a ring buffer that is allocated once.
 
-    One transition is one row (state, next_state, and as float32 action, reward, terminal_state), so that it is drawn
-    and handed to TensorFlow as one array. float32 holds an action's index exactly up to 2^24.
+    One transition is one row: state, next_state, then action, reward and terminal_state as float32. So a batch is drawn
+    and passed to TensorFlow as one array. float32 holds an action's index exactly up to 2^24.
 
     Args:
-        memory_size: transitions.
-        state_shape: of one state, such as (4,), or (84, 84, 4) for images.
-        dtype: of the states: float32, or uint8, which takes a quarter of the room.
+        memory_size: number of transitions.
+        state_shape: shape of one state, such as (4,), or (84, 84, 4) for images.
+        dtype: dtype of the states: float32, or uint8, which needs a quarter of the space.
     """
 
     def __init__(self, memory_size: int, state_shape: tuple[int, ...], dtype: Any = np.float32) -> None:
@@ -52,15 +52,15 @@ class ReplayMemory:
         self._next_states = self.rows[:, size : 2 * size].reshape(memory_size, *self.state_shape)
         self._scalars = self.rows[:, 2 * size :].view(np.float32)  # [memory_size, 3]
         self.num_appended = 0
-        """Transitions ever appended; the next one goes to row `num_appended % memory_size`."""
+        """Number of all transitions appended so far; the next one goes to row `num_appended % memory_size`."""
 
     def __len__(self) -> int:
         return min(self.num_appended, len(self.rows))
 
     def append(self, experience: Experience) -> None:
-        """Remember one transition by value; when the memory is full, the oldest is forgotten.
+        """Stores a copy of one transition; when the memory is full, it replaces the oldest.
 
-        It stands in the innermost loop and checks nothing; `train` checks what comes out of the environment.
+        It checks nothing, because it runs in the innermost loop; `train` checks what the environment returns.
         """
         i = self.num_appended % len(self.rows)
         scalars = self._scalars[i]
@@ -68,9 +68,10 @@ class ReplayMemory:
         self.num_appended += 1
 
     def sample_rows(self, batch_size: int, rng: np.random.Generator) -> np.ndarray:
-        """A uniformly random batch without repeats, as rows; drawn by one `rng.choice`.
+        """Returns a uniformly random batch without repeats, as rows; one `rng.choice` draws it.
 
-        Index 0 is the oldest transition that is left, as in a deque. ValueError if the memory holds fewer.
+        Index 0 is the oldest transition in the memory, as in a deque. Raises ValueError if the memory holds fewer than
+        `batch_size`.
         """
         indices = rng.choice(len(self), batch_size, replace=False)  # [B]
         if self.num_appended > len(self.rows):
@@ -78,12 +79,12 @@ class ReplayMemory:
         return self.rows.take(indices, axis=0)
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Experience:
-        """A uniformly random batch without repeats, as arrays with a leading axis B."""
+        """Returns a uniformly random batch without repeats, as arrays with a leading axis B."""
         return unpack(self.sample_rows(batch_size, rng), self.state_shape)
 
 
 def unpack(rows: Any, state_shape: tuple[int, ...]) -> Experience:
-    """Rows of a ReplayMemory as a batch of B; for NumPy arrays and tensors alike."""
+    """Converts B rows of a ReplayMemory, a NumPy array or a tensor, to a batch."""
     size, shape = math.prod(state_shape), (-1, *state_shape)
     states, next_states, scalars = rows[:, :size], rows[:, size : 2 * size], rows[:, 2 * size :]
     if tf.is_tensor(rows):
@@ -99,7 +100,7 @@ def unpack(rows: Any, state_shape: tuple[int, ...]) -> Experience:
 
 
 def pack(experience: Experience) -> tf.Tensor:
-    """One transition, of tensors, as a row of a ReplayMemory."""
+    """Converts one transition, given as tensors, to a row of a ReplayMemory."""
     state, action, reward, next_state, terminal_state = experience
     scalars = tf.stack([tf.cast(x, tf.float32) for x in (action, reward, terminal_state)])
     if state.dtype != tf.float32:

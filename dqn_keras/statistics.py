@@ -1,4 +1,4 @@
-"""Statistics of many seeds, with intervals."""
+"""Statistics over many seeds, with 95 % intervals."""
 
 import functools
 from typing import Any, NamedTuple
@@ -18,24 +18,24 @@ class Estimate(NamedTuple):
 
     def __str__(self) -> str:
         digits = 1 if abs(self.value) >= 10 else 3
-        if np.isnan(self.low):  # nothing to tell an interval from
+        if np.isnan(self.low):  # there is no interval
             return f"{self.value:.{digits}f}"
         return f"{self.value:.{digits}f} ({self.low:.{digits}f} to {self.high:.{digits}f})"
 
 
 class Summary(NamedTuple):
-    """What a study says of its configuration. A seed that was not solved counts with the episodes it had."""
+    """The statistics of a study. A seed that was not solved counts with `num_episodes` episodes."""
 
     share_solved: Estimate
-    """Of the seeds, within `num_episodes`; Wilson interval."""
+    """Share of the seeds that are solved within `num_episodes`; Wilson interval."""
     median: Estimate
-    """Episodes to solved; bootstrap interval. Not touched by how late the latest are, if most are solved."""
+    """Median of the episodes to solved; bootstrap interval. If most seeds are solved, the slowest do not change it."""
     interquartile_mean: Estimate
-    """Episodes to solved, mean of the middle half; bootstrap interval."""
+    """Mean of the middle half of the episodes to solved; bootstrap interval."""
 
 
 def summarize(study: Study) -> Summary:
-    """Share of seeds solved, median and interquartile mean of the episodes to solved."""
+    """Returns the share of seeds solved, and the median and interquartile mean of the episodes to solved."""
     if not study.outcomes:
         raise ValueError("study must have at least one seed, got none")
     episodes, num_solved = study.episodes_to_solved, int(np.isfinite(study.solved_at).sum())
@@ -48,16 +48,17 @@ def summarize(study: Study) -> Summary:
 
 
 class Comparison(NamedTuple):
-    """Of two studies."""
+    """The comparison of two studies."""
 
     difference: Estimate
-    """Median episodes to solved of the second minus those of the first."""
+    """Median of the episodes to solved in the second study, minus the median in the first."""
     probability_of_improvement: Estimate
-    """That a run of the second is solved earlier than one of the first; ties count half (Agarwal et al. 2021)."""
+    """Probability that a run of the second study is solved earlier than a run of the first; ties count half (Agarwal et
+    al. 2021)."""
 
 
 def compare(first: Study, second: Study) -> Comparison:
-    """How two configurations differ in the episodes they need; bootstrap intervals."""
+    """Compares the episodes that two configurations need until they are solved; bootstrap intervals."""
     samples = first.episodes_to_solved, second.episodes_to_solved
     return Comparison(_bootstrap(_difference, *samples), _bootstrap(_probability_of_improvement, *samples))
 
@@ -73,7 +74,7 @@ def _probability_of_improvement(first: np.ndarray, second: np.ndarray, axis: int
 
 def _bootstrap(statistic: Any, *samples: np.ndarray) -> Estimate:
     value = float(statistic(*samples))
-    if all(len(np.unique(sample)) == 1 for sample in samples):  # as in a study of one seed: nothing to resample
+    if all(len(np.unique(sample)) == 1 for sample in samples):  # for example, one seed: nothing to resample
         return Estimate(value, np.nan, np.nan)
     interval = scipy.stats.bootstrap(
         samples, statistic, n_resamples=2_000, method="percentile", rng=np.random.default_rng(0), batch=200

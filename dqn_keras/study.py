@@ -1,4 +1,4 @@
-"""Many seeds of one run: how reliable is it? One seed is an anecdote."""
+"""A study: the same run with many seeds, to see how reliable it is. One seed is an anecdote."""
 
 import contextlib
 import dataclasses
@@ -39,35 +39,35 @@ from dqn_keras.training import train
 
 
 class Outcome(NamedTuple):
-    """What came of one seed."""
+    """The result of one seed."""
 
     seed: int
     rewards: np.ndarray
-    """[num_episodes] float64, as `Run.rewards`."""
+    """Reward of each episode, [num_episodes] float64, as in `Run.rewards`."""
     steps: np.ndarray
-    """[num_episodes] int64, environment steps of each episode."""
+    """Environment steps of each episode, [num_episodes] int64."""
     solved_at: int | None
-    """As `Run.solved_at`."""
+    """Number of the episode after which the stop rule held, as in `Run.solved_at`; None if it never did."""
     digest: bytes
-    """SHA-256 of the final weights of both networks: equal for equal bits."""
+    """SHA-256 of the final weights of both networks: equal if all bits are equal."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Study:
-    """What came of `study`: arrays with one entry for each seed."""
+    """The result of `study`: arrays with one entry for each seed."""
 
     config: Config
     outcomes: list[Outcome]
-    """One per seed, in the order asked for; seeds that were interrupted are not among them."""
+    """One outcome per seed, in the order of the `seeds` asked for; interrupted seeds are missing."""
 
     @property
     def seeds(self) -> np.ndarray:
-        """[S] int64."""
+        """The seeds, [S] int64."""
         return np.array([outcome.seed for outcome in self.outcomes], np.int64)
 
     @functools.cached_property
     def rewards(self) -> np.ndarray:
-        """[S, num_episodes] float64: each episode's reward; NaN after a run's last."""
+        """Each episode's reward, [S, num_episodes] float64; NaN after a run's last episode."""
         longest = max((len(outcome.rewards) for outcome in self.outcomes), default=0)
         rewards = np.full((len(self.outcomes), longest), np.nan)
         for row, outcome in zip(rewards, self.outcomes, strict=True):
@@ -76,17 +76,17 @@ class Study:
 
     @property
     def solved_at(self) -> np.ndarray:
-        """[S] float64: the episode at whose end the stop rule held; NaN where it never did."""
+        """The number of the episode after which the stop rule held, [S] float64; NaN if it never did."""
         return np.array([np.nan if o.solved_at is None else o.solved_at for o in self.outcomes], np.float64)
 
     @property
     def episodes_to_solved(self) -> np.ndarray:
-        """[S] float64: the same, with `config.num_episodes` where it never did."""
+        """The same as `solved_at`, [S] float64, but `config.num_episodes` if the stop rule never held."""
         return np.nan_to_num(self.solved_at, nan=self.config.num_episodes)
 
     @property
     def num_env_steps(self) -> int:
-        """Environment steps of all seeds together."""
+        """The number of environment steps of all seeds together."""
         return int(sum(outcome.steps.sum() for outcome in self.outcomes))
 
     def __repr__(self) -> str:
@@ -103,21 +103,21 @@ def study(
     num_workers: int | None = None,
     verbose: int = 1,
 ) -> Study:
-    """Train one agent for each seed, several at once; each is the very run that `train(env, config, seed)` gives.
+    """Trains one agent for each seed, several at once; each run is exactly that of `train(env, config, seed)`.
 
-    Ctrl-C ends it, and what is finished is returned; without `file` the rest of the seeds can only be done anew.
+    Ctrl-C ends the study and returns the finished seeds. Only a study with a `file` can be continued.
 
     Args:
-        env: as for `train`. Each worker process has a pickled copy of its own.
+        env: an environment, as for `train`. Each worker process gets its own pickled copy.
         config: the parameters of every run.
-        seeds: whole numbers, each once.
-        file: where to keep what is finished. The same study again does only what is missing; Ctrl-C, or a crash,
-            loses what has not been finished.
+        seeds: whole numbers without repeats.
+        file: a file for the finished seeds. If you repeat the study, it trains only the missing seeds. Ctrl-C or a
+            crash loses the unfinished ones.
         engine: "joblib", processes on this machine; or "ray", tasks on the Ray cluster that this process is connected
-            to, or else on this machine (needs the extra `ray`); a task whose worker dies is tried again.
-        num_workers: processes of joblib; by default as many as there are cores. With 1 all is done in this process.
-            (Ray has as many as its cluster has cores.) A worker's copy of the environment holds what it uses of your
-            own modules as it is now.
+            to, or else on this machine (needs the extra `ray`). A Ray task is repeated if its worker dies.
+        num_workers: number of joblib's processes; by default one for each core. With 1, everything runs in this
+            process. (Ray uses all cores of its cluster.) A worker's copy of the environment includes your own modules
+            that it uses, in their present state.
         verbose: 1 shows a progress bar, 0 nothing.
 
     Raises:
@@ -165,17 +165,17 @@ _Results = Generator[Outcome | None, None, None]
 
 
 class _PickledEnv(NamedTuple):
-    """What a worker makes its environment from."""
+    """What a worker needs to make its environment."""
 
     pickled: bytes
     computes: str
-    """A digest of what a functional environment computes here."""
+    """Digest of what a functional environment computes in this process."""
     study: str
-    """Tells this call of `study` from others, in which the environment may have been another."""
+    """Identifier of this call of `study`; another call may have another environment."""
 
 
 def _pickled_env(env: gym.Env | FuncEnv) -> _PickledEnv:
-    """A copy of the environment, or, if it cannot be copied, as after rendering, its spec."""
+    """Pickles the environment, or only its spec if it cannot be pickled, for example after rendering."""
     try:
         pickled = _pickled_with_its_modules(env)
     except (TypeError, AttributeError, pickle.PicklingError):
@@ -186,14 +186,14 @@ def _pickled_env(env: gym.Env | FuncEnv) -> _PickledEnv:
 
 
 def _pickled_with_its_modules(env: gym.Env | FuncEnv) -> bytes:
-    """With what it uses of the user's modules as it is now, where a worker would import what is on the disk."""
+    """Pickles the environment with the user's modules as they are now; a worker would import those on the disk."""
     modules = [x for x in sys.modules.copy().values() if isinstance(x, ModuleType) and not is_of_a_library(x)]
     modules = [x for x in modules if sys.modules.get(x.__name__) is x and x.__name__ != "__main__"]
     for module in modules:
         cloudpickle.register_pickle_by_value(module)
     try:
         return cloudpickle.dumps(env)
-    except Exception:  # something in them cannot be copied, such as a lock
+    except Exception:  # something in them cannot be pickled, such as a lock
         pass
     finally:
         for module in modules:
@@ -203,7 +203,7 @@ def _pickled_with_its_modules(env: gym.Env | FuncEnv) -> bytes:
 
 @functools.lru_cache(maxsize=1)
 def _parts(env_copy: _PickledEnv) -> tuple[gym.Env | FuncEnv, dict]:
-    """The process's own environment, and the programs compiled for it: made once in a study."""
+    """Returns this process's own environment and the programs compiled for it, both made once in a study."""
     env = cloudpickle.loads(env_copy.pickled)
     if isinstance(env, gym.envs.registration.EnvSpec):
         env = gym.make(env)
@@ -216,7 +216,7 @@ def _parts(env_copy: _PickledEnv) -> tuple[gym.Env | FuncEnv, dict]:
 
 
 def _train_seed(env_copy: _PickledEnv, config: Config, seed: int) -> Outcome | None:
-    """One agent, in whatever process; None if it was interrupted there."""
+    """Trains one seed in this process; returns None if it was interrupted."""
     env, programs = _parts(env_copy)
     with shared_in(programs):
         run = train(env, config, seed, verbose=0)
@@ -230,8 +230,8 @@ def _train_seed(env_copy: _PickledEnv, config: Config, seed: int) -> Outcome | N
 
 
 def _train_seed_in_worker(env_copy: _PickledEnv, config: Config, seed: int) -> Outcome | None:
-    """The same in a process of its own. TensorFlow gets one thread there: there is a process for each core."""
-    with contextlib.suppress(RuntimeError):  # it has started already, in a worker that someone else has used
+    """Trains one seed in a worker process. TensorFlow gets one thread there, because each core has a process."""
+    with contextlib.suppress(RuntimeError):  # TensorFlow has started already, in a worker with an earlier task
         tf.config.threading.set_intra_op_parallelism_threads(1)
     return _train_seed(env_copy, config, seed)
 
@@ -248,7 +248,7 @@ def _by_joblib(env_copy: _PickledEnv, config: Config, seeds: list[int], num_work
 
 @contextlib.contextmanager
 def _interrupts_ignored_by_children() -> Iterator[None]:
-    """A terminal sends Ctrl-C to all its processes; those that start in here leave it to this one."""
+    """Makes processes that start inside it ignore Ctrl-C, which a terminal sends to all; this process handles it."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -293,7 +293,7 @@ def _save(path: Path, outcomes: dict[int, Outcome], facts: dict[str, Any]) -> No
 
 
 def _load(path: Path, facts: dict[str, Any]) -> dict[int, Outcome]:
-    """By seed; none if there is no file yet."""
+    """Returns the outcomes by seed; none if there is no file yet."""
     if not path.exists():
         return {}
     outcomes, theirs = _read(path)
@@ -314,7 +314,7 @@ def _read(path: Path) -> tuple[dict[int, Outcome], dict[str, Any]]:
 
 
 def load_study(path: str | os.PathLike) -> Study:
-    """The study that `study(..., file=path)` kept, all of its seeds in ascending order."""
+    """Loads the study that `study(..., file=path)` saved, with all its seeds in ascending order."""
     outcomes, facts = _read(Path(path))
     fields = {**facts["config"], "hidden_units": tuple(facts["config"]["hidden_units"])}
     return Study(Config(**fields), list(outcomes.values()))

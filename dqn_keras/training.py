@@ -1,4 +1,4 @@
-"""train: a whole run, from fresh networks to the stop rule."""
+"""train: a whole run, from new networks to the stop rule."""
 
 import contextlib
 import dataclasses
@@ -34,55 +34,55 @@ from dqn_keras.storage.networks import save_q_network
 
 @dataclasses.dataclass(repr=False)
 class Run:
-    """What came of `train`."""
+    """The result of `train`."""
 
     config: Config
     agent: Agent
-    """Networks, optimizer, memory and random state, as the last episode left them."""
+    """Networks, optimizer, memory and random state after the last episode."""
     interrupted: bool = False
-    """Whether Ctrl-C or SIGTERM came: it has then ended at the end of that episode."""
+    """Whether Ctrl-C or SIGTERM ended the run, at the end of an episode."""
     diverged: bool = False
     """Whether learning diverged, and a callback (keras.callbacks.TerminateOnNaN) ended the run without an error."""
     steps_per_second: list[float] = dataclasses.field(default_factory=list)
-    """Environment steps, learning included, of each episode; NaN for those that were played before a resume."""
+    """Environment steps per second of each episode, learning included; NaN for episodes from before a resume."""
 
     @property
     def solved_at(self) -> int | None:
-        """The number (from 0) of the episode at whose end the stop rule held; None if it never did."""
+        """The number (from 0) of the episode after which the stop rule held; None if it never did."""
         return len(self.episodes) - 1 if _is_solved(self.episodes, self.config) else None
 
     @property
     def episodes(self) -> list[Episode]:
-        """What happened, episode by episode."""
+        """The record of each episode."""
         return self.agent.episodes
 
     @property
     def rewards(self) -> np.ndarray:
-        """[num_episodes] float64, each episode's undiscounted sum."""
+        """Each episode's undiscounted sum of rewards, [num_episodes] float64."""
         return np.array([episode.reward for episode in self.episodes], np.float64)
 
     @property
     def history(self) -> dict[str, list[float]]:
-        """What callbacks were told, a list for each name, as `history` of what Keras' `model.fit` returns."""
+        """The logs that callbacks get, one list for each name, like `history` in the result of Keras' `model.fit`."""
         return history(self.episodes, self.config, self.steps_per_second)
 
     @property
     def seed(self) -> int:
-        """With it, `train` gives this run again."""
+        """The seed with which `train` repeats this run."""
         return self.agent.seed
 
     @property
     def q_network(self) -> keras.Sequential:
-        """The network that acts; a plain Keras model."""
+        """The network that acts: a plain Keras model."""
         return self.agent.q_network
 
     @property
     def q_hat_network(self) -> keras.Sequential:
-        """The slow copy that the targets were computed from."""
+        """The slow copy, which gave the targets."""
         return self.agent.q_hat_network
 
     def save(self, path: str | os.PathLike) -> None:
-        """Save the network that acts, alone, as a .keras file; `load_q_network`, or Keras anywhere, loads it."""
+        """Saves only the network that acts, as a .keras file; `load_q_network`, or Keras anywhere, loads it."""
         save_q_network(path, self.q_network)
 
     def __repr__(self) -> str:
@@ -105,49 +105,52 @@ def train(
     resume: bool = False,
     verbose: int = 1,
 ) -> Run:
-    """Trains a Deep Q-Network until it solves `env` or `config.num_episodes` are over.
+    """Trains a Deep Q-Network until it solves `env` or has played `config.num_episodes` episodes.
 
-    What you pass in is what runs: your network, optimizer, targets, loss and environment are used as the objects they
-    are, and compiled again at each call of `train`, so that a change you made since is seen.
+    `train` uses your network, optimizer, targets, loss and environment themselves, not copies of them. It compiles them
+    again at each call, so that it sees your changes.
 
     Args:
-        env: a gymnasium.Env with a Box observation space and a Discrete action space; or a functional one
-            (gymnasium.experimental.functional.FuncEnv) written in TensorFlow, whose episodes are compiled whole, such
-            as `dqn_keras.environments.CartPole()`.
-        config: the parameters; by default the original notebook's.
-        seed: a whole number. One seed, one result, bit for bit, on one machine; None draws one (see `run.seed`).
+        env: a gymnasium.Env with a Box observation space and a Discrete action space; or a functional environment
+            (gymnasium.experimental.functional.FuncEnv) written in TensorFlow, such as
+            `dqn_keras.environments.CartPole()`, whose whole episodes are compiled.
+        config: the parameters; the defaults are the original notebook's.
+        seed: a whole number. The same seed gives the same result, bit for bit, on one machine. None draws a seed (see
+            `run.seed`).
         q_network: a network of your own, states [B, *S] -> Q-values [B, A] float32: a built Sequential or functional
-            model, trained in place from the weights it has; Q-hat starts as its equal copy. Its layers are called in
-            inference mode, and its regularization losses are added to the loss. By default that of `make_q_network`,
-            for observations of one axis. Where observations are uint8, as images are, they stay that in the memory, and
-            the network scales them (keras.layers.Rescaling(1 / 255)).
-        optimizer: a Keras optimizer. By default that of a `q_network` which you have compiled, or else Adam with
-            `config.alpha`. With an optimizer of your own, `config.alpha` must be left as it is.
+            model. It is trained in place, from the weights it has; Q-hat starts as an equal copy. Its layers are called
+            in inference mode, and its regularization losses are added to the loss. The default is a network of
+            `make_q_network`, for observations with one axis. uint8 observations, such as images, stay uint8 in the
+            memory; the network scales them (keras.layers.Rescaling(1 / 255)).
+        optimizer: a Keras optimizer. The default is the one that you compiled `q_network` with, or else Adam with
+            `config.alpha`. With an optimizer of your own, leave `config.alpha` at its default.
         targets: the formula for y: `td_targets`, `double_td_targets`, or a function of the same form. No gradient flows
             through it.
-        loss: what Keras takes in `compile`: a name, a `keras.losses.Loss`, or a function of (y, q), both [B] -> a
-            scalar or [B], which is averaged. By default that of a `q_network` which you have compiled, or else "mse".
-        callbacks: Keras callbacks; an episode is an epoch of one batch, and its logs are what `run.history` holds.
-            They see the network as the episode left it, may change it, and may set `model.stop_training`. So compiled
-            episodes are then played one at a time, unless all callbacks are plain keras.callbacks.CSVLogger.
-        checkpoint: a folder for this run's checkpoints, each its whole state; None saves none. If the disk refuses
-            one on the way, that is a warning, and the run goes on. What is put into the environment after it was made,
-            or kept under other names than the constructor's, is not noticed to differ.
-        checkpoint_every: episodes between two of them, or a few more where episodes are compiled; the start and the
-            end of the run are saved too.
-        resume: go on from the newest checkpoint in the folder that is whole, or start if there is none yet. The
-            result is that of a run that was never interrupted, bit for bit; everything else must be the same, but for a
-            num_episodes that may be larger. What callbacks remember is theirs to save. With a checkpoint, functions and
-            classes of your own need a name that can be imported; what they compute tells whether they are the same.
-        verbose: 1 prints a line every 100 episodes and one when solved, 2 shows a progress bar beside them, 0 nothing.
+        loss: any loss that Keras takes in `compile`: a name, a `keras.losses.Loss`, or a function of (y, q), both [B].
+            The function returns a scalar, or [B], which is averaged. The default is the loss that you compiled
+            `q_network` with, or else "mse".
+        callbacks: Keras callbacks. An episode is an epoch of one batch, with the logs that `run.history` holds.
+            Callbacks see the network after each episode, may change it, and may set `model.stop_training`. Therefore
+            compiled episodes are played one at a time, unless all callbacks are plain keras.callbacks.CSVLogger.
+        checkpoint: a folder for the checkpoints of this run, each with its whole state; None saves none. If one cannot
+            be written during the run, a warning says so and the run continues. A resume does not notice every change
+            of the environment: not values that were set after it was made, and not constructor arguments that it keeps
+            under other names.
+        checkpoint_every: episodes from one checkpoint to the next; a few more if episodes are compiled. The start and
+            the end of the run are saved too.
+        resume: continue from the newest undamaged checkpoint in the folder, or start if there is none yet. The result
+            is bit for bit that of a run without interruption. Everything else must be the same, except that
+            num_episodes may be larger. Callbacks must save their own state. With a checkpoint, your own functions and
+            classes need a name that can be imported; they count as the same if they compute the same.
+        verbose: 1 prints a line every 100 episodes and one when solved; 2 also shows a progress bar; 0 prints nothing.
 
-    Ctrl-C, an interrupted notebook cell and SIGTERM end the run at the end of an episode, saved if there is a
-    checkpoint, and `train` returns what there is, marked `interrupted`; a second one raises KeyboardInterrupt.
+    Ctrl-C, an interrupted notebook cell and SIGTERM end the run at the end of an episode. The run is saved if there is
+    a checkpoint folder, and `train` returns it, marked `interrupted`. A second signal raises KeyboardInterrupt.
 
     Raises:
         TypeError, ValueError: an argument or a space is not supported; the network does not fit the environment; the
-            environment returned a NaN, an infinity or another shape than promised (the message names episode and
-            step); learning diverged.
+            environment returned a NaN, an infinity or a wrong shape (the message names episode and step); learning
+            diverged.
     """
     check_arguments(env, config, verbose)
     callbacks, checkpoint_every = check_callbacks(callbacks), check_count("checkpoint_every", checkpoint_every)
@@ -198,18 +201,19 @@ def _episodes(
     callbacks: Sequence[keras.callbacks.Callback],
     episodes_per_call: int,
 ) -> Iterator[Episode]:
-    """The loop that plays `env`."""
+    """Returns the episodes of the loop that can play `env`."""
     if not isinstance(env, FuncEnv):
         return gymnasium.episodes(CheckedEnv(env), run.agent, run.config, formulas)
-    # A callback may change the agent between episodes, and sees it as it then is.
+    # Other callbacks may read and change the agent after each episode.
     only_logs = all(type(callback) is keras.callbacks.CSVLogger for callback in callbacks)
     return compiled.episodes(env, spaces, run.agent, run.config, episodes_per_call if only_logs else 1, formulas)
 
 
 def _finisher(run: Run, checkpoints: Checkpoints | None) -> Callable[[], None]:
-    """A function that makes the averages of the weights the result, as `fit` does, if the optimizer keeps them.
+    """Returns a function that replaces the weights by their averages, as `fit` does, if the optimizer keeps averages.
 
-    The checkpoint holds the weights themselves, which a resumed run learns on with. A second call does nothing.
+    Before that, a checkpoint saves the weights themselves, because a resumed run continues from them. A second call
+    does nothing.
     """
 
     @functools.cache
@@ -230,14 +234,14 @@ def _play_until_over(
     checkpoints: Checkpoints | None,
     is_asked_to_stop: Callable[[], bool],
 ) -> None:
-    """Plays to the stop rule, the last episode or a request to stop, and keeps what there is on the way."""
-    if run.solved_at is not None:  # as a resumed run may be
+    """Plays until the stop rule, the last episode or a request to stop, and saves checkpoints."""
+    if run.solved_at is not None:  # a resumed run may be solved already
         return
     with contextlib.closing(played):
         for episode in played:
             progress.show(episode)
             if len(run.episodes) > episode.number + 1:
-                continue  # compiled episodes: the agent is already further
+                continue  # compiled episodes: the agent is ahead of this one
             if checkpoints:
                 checkpoints.save_when_due(run.agent)
             if run.solved_at is not None or is_asked_to_stop():
@@ -245,7 +249,7 @@ def _play_until_over(
 
 
 def _timed(episodes: Iterator[Episode], run: Run) -> Generator[Episode, None, None]:
-    """Notes the speed of each episode; the episodes that one call plays all get the speed of the call."""
+    """Yields the episodes and notes their speed; all episodes of one compiled call get the speed of the call."""
     while True:
         start = time.perf_counter()
         episode = next(episodes, None)
@@ -259,7 +263,7 @@ def _timed(episodes: Iterator[Episode], run: Run) -> Generator[Episode, None, No
 
 
 def _is_solved(episodes: Sequence[Episode], config: Config) -> bool:
-    """The stop rule, at the end of the last episode.
+    """Returns whether the stop rule holds after the last episode.
 
     The original also takes the mean of fewer episodes than the window, so that one lucky first episode could stop it.
     """

@@ -1,4 +1,4 @@
-"""What the commands of the command line do: each takes its options, and returns its exit code."""
+"""The commands of the command line: each takes its options and returns its exit code."""
 
 import contextlib
 import os
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def train(options: "cli.Train") -> int:
-    """Train in a new folder."""
+    """Trains an agent in a new folder."""
     seed = checked_seed(options.seed)
     folder = options.out or _default_folder(options.env, str(seed))
     settings = Settings(_env_options(options), seed, options.config, options.tensorboard)
@@ -32,20 +32,20 @@ def train(options: "cli.Train") -> int:
 
 
 def resume(options: "cli.Resume") -> int:
-    """Go on in a folder."""
+    """Continues the run of a folder."""
     run = run_folder.resume(options.folder, options.num_episodes, _verbosity(options.quiet))
     return _tell(run, options.folder, options.quiet)
 
 
 def watch(options: "cli.Watch") -> int:
-    """Play in a window, or into a GIF."""
+    """Plays greedily in a window, or writes a GIF."""
     settings, network = run_folder.read_settings(options.folder), run_folder.read_q_network(options.folder)
     max_steps = settings.config.max_steps
     if _has_display() and not options.gif:
         with contextlib.closing(settings.env.make(render_mode="human")) as env:
             _print_returns(play_greedily(env, network, options.episodes, options.seed, max_steps))
         return 0
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pictures are drawn without a display
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # lets pygame draw without a display
     with contextlib.closing(settings.env.make(render_mode="rgb_array")) as env:
         frames = record_episode(env, network, options.seed, max_steps)
         fps = env.metadata.get("render_fps", 30)
@@ -56,7 +56,7 @@ def watch(options: "cli.Watch") -> int:
 
 
 def evaluate(options: "cli.Evaluate") -> int:
-    """Play greedily."""
+    """Plays greedily and prints the returns."""
     settings, network = run_folder.read_settings(options.folder), run_folder.read_q_network(options.folder)
     with contextlib.closing(settings.env.make()) as env:
         _print_returns(play_greedily(env, network, options.episodes, options.seed, settings.config.max_steps))
@@ -64,7 +64,7 @@ def evaluate(options: "cli.Evaluate") -> int:
 
 
 def study(options: "cli.Study") -> int:
-    """Train many seeds."""
+    """Trains many seeds and prints their statistics."""
     folder = options.out or _default_folder(options.env, "study")
     if options.config.num_episodes < options.config.solved_window:
         raise ValueError(
@@ -89,7 +89,7 @@ def study(options: "cli.Study") -> int:
 
 
 def plot(options: "cli.Plot") -> int:
-    """Draw the picture of a folder."""
+    """Draws the curves of a folder."""
     print(f"The curves are in {run_folder.draw(options.folder)}")
     return 0
 
@@ -103,7 +103,7 @@ def _default_folder(env_id: str, name: str) -> Path:
 
 
 def _tell(run: Run, folder: Path, quiet: bool) -> int:
-    """Say how a run has ended."""
+    """Prints how a run has ended, and returns the exit code."""
     if run.interrupted:
         return _interrupted(f"dqn-keras resume {shlex.quote(str(folder))}")
     if not quiet:

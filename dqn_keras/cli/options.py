@@ -1,6 +1,6 @@
-"""The command line: its options, and what becomes of errors. What the commands do is in `commands`.
+"""The options of the command line, and how it reports errors. The commands themselves are in `commands`.
 
-TensorFlow and Gymnasium are not imported before a command is run, so that `--help` is there at once.
+TensorFlow and Gymnasium are imported only when a command runs, so that `--help` appears at once.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ Folder = Annotated[Positional[Path], arg(metavar="FOLDER")]
 
 @dataclasses.dataclass(frozen=True)
 class _Unchecked(Config):
-    """The parameters as they were typed. Config checks them, with messages that need no box of tyro's around them."""
+    """The parameters as they were typed. Config checks them later, so that tyro puts no box around its messages."""
 
     def __post_init__(self) -> None:
         """Checks nothing."""
@@ -35,95 +35,99 @@ class _Unchecked(Config):
 
 @dataclasses.dataclass(kw_only=True)
 class _Task:
-    """An environment, and how to learn it."""
+    """An environment and how to learn it."""
 
     env: Annotated[Positional[str], arg(metavar="ENV")]
-    """Id of a Gymnasium environment, such as CartPole-v1; MODULE:ID imports the module that registers it."""
+    """Id of a Gymnasium environment, such as CartPole-v1. MODULE:ID imports the module that registers it."""
     config: OmitArgPrefixes[_Unchecked] = _Unchecked()
-    """The parameters of the algorithm; the defaults are the original notebook's."""
+    """Parameters of the algorithm. The defaults are the original notebook's."""
     env_args: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE ...", help_behavior_hint="(default: none)")] = ()
-    """Arguments of gymnasium.make, such as is_slippery=False map_name=8x8."""
+    """Arguments for gymnasium.make, such as is_slippery=False map_name=8x8."""
     flatten: Flag = False
-    """Flatten the observations to one axis (FlattenObservation), as Discrete ones need it."""
+    """Flatten the observations to one axis (FlattenObservation). Discrete observations need it."""
     compiled: Flag = False
-    """Compile whole episodes: seconds of compilation, and then about ten times as fast. For CartPole-v1, Acrobot-v1 and
-    MountainCar-v0, which have a functional twin."""
+    """Compile whole episodes. This takes seconds; training is then about ten times as fast.
+    Only for CartPole-v1, Acrobot-v1 and MountainCar-v0, which have a functional twin."""
 
 
 @dataclasses.dataclass(kw_only=True)
 class Train(_Task):
-    """Train an agent, and keep it in a folder."""
+    """Train an agent and keep it in a folder."""
 
     seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: drawn)")] = None
-    """One seed, one run, bit for bit."""
+    """Seed of the run. The same seed gives the same run, bit for bit."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: runs/ENV-SEED)")] = None
-    """Where to keep the run: config.json (environment, seed, parameters, versions), log.csv (a line for each episode),
-    agent.keras (the network), curve.png, and checkpoint/, from which `resume` goes on. Ctrl-C ends the run at the end
-    of an episode, and all of it is kept."""
+    """Folder for the run, with these files:
+    config.json (environment, seed, parameters, versions),
+    log.csv (a line for each episode),
+    agent.keras (the network),
+    curve.png, and checkpoint/, from which `resume` continues.
+    Ctrl-C ends the run at the end of an episode and keeps everything."""
     tensorboard: Flag = False
     """Also write every scalar for TensorBoard, into the folder's tensorboard/ (slower)."""
     quiet: Flag = False
-    """Print nothing but errors."""
+    """Print only errors."""
 
 
 @dataclasses.dataclass(kw_only=True)
 class Resume:
-    """Go on with a run that was interrupted, was killed, or is to be longer: bit for bit as if it had never ended."""
+    """Continue an interrupted or killed run, or make a run longer: bit for bit as without a break."""
 
     folder: Folder
-    """Of the run."""
+    """Folder of the run."""
     num_episodes: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: as before)")] = None
-    """Episodes after which training ends."""
+    """Maximum number of episodes."""
     quiet: Flag = False
-    """Print nothing but errors."""
+    """Print only errors."""
 
 
 @dataclasses.dataclass(kw_only=True)
 class Watch:
-    """Watch the agent play: in a window, or, without a display, in a GIF."""
+    """Watch the agent play in a window or, without a display, in a GIF."""
 
     folder: Folder
-    """Of the run; the GIF goes there, too."""
+    """Folder of the run; the GIF is written there."""
     episodes: int = 3
-    """How many to show in the window; the GIF holds the first."""
+    """Number of episodes in the window; the GIF shows only the first."""
     seed: int = 0
-    """Of the starts, which are none of training's."""
+    """Seed of the start states, which differ from those in training."""
     gif: Flag = False
-    """Write the GIF even where there is a display."""
+    """Write a GIF even if there is a display."""
 
 
 @dataclasses.dataclass(kw_only=True)
 class Evaluate:
-    """Let the agent play greedily, from starts that training has not seen."""
+    """Let the agent play greedily, from start states that differ from those in training."""
 
     folder: Folder
-    """Of the run."""
+    """Folder of the run."""
     episodes: int = 100
-    """How many."""
+    """Number of episodes."""
     seed: int = 0
-    """Of the starts."""
+    """Seed of the start states."""
 
 
 @dataclasses.dataclass(kw_only=True)
 class Study(_Task):
-    """Train an agent for each of many seeds, on all cores: how reliable is it?"""
+    """Train an agent for each of many seeds, on all cores, to see how reliable it is."""
 
     seeds: int = 100
-    """How many: 0, 1, 2, ..."""
+    """Number of seeds; they are 0, 1, 2, ..."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: runs/ENV-study)")] = None
-    """Where to keep the study: study.npz and study.png. The same command again does only what is missing."""
+    """Folder for the study: study.npz and study.png.
+    If you repeat the command, it trains only the missing seeds."""
     workers: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: one for each core)")] = None
-    """Processes."""
+    """Number of processes."""
     quiet: Flag = False
-    """Print nothing but errors and the result."""
+    """Print only errors and the result."""
 
 
 @dataclasses.dataclass(kw_only=True)
 class Plot:
-    """Draw the curves of a run or a study; of a run also while it is going on."""
+    """Draw the curves of a study or a run, even while the run is in progress."""
 
     folder: Folder
-    """Of the run or the study; the picture goes there, as curve.png or study.png."""
+    """Folder of the run or the study; the picture is written there, as curve.png or study.png."""
 
 
 _COMMANDS: Any = Train | Resume | Watch | Evaluate | Study | Plot
@@ -132,7 +136,7 @@ _COMMANDS: Any = Train | Resume | Watch | Evaluate | Study | Plot
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line and returns its exit code: 0, 2 after an error, 130 after Ctrl-C, 141 after a broken pipe.
 
-    An error is one line on standard error; about an option that cannot be read, a box with the help of that option.
+    An error is one line on standard error; for an option that cannot be read, it is a box with the option's help.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments == ["--version"]:
@@ -141,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ.setdefault("MPLBACKEND", "Agg")
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    sys.path.append(os.getcwd())  # where MODULE:ID looks, however this was started
+    sys.path.append(os.getcwd())  # MODULE:ID looks here too, however this was started
     command = None
     try:
         command = tyro.cli(
@@ -156,12 +160,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         warnings.formatwarning = lambda message, *_: f"dqn-keras: {_in_plain_text(str(message))}\n"
         return getattr(commands, type(command).__name__.lower())(command)
-    except SystemExit as end:  # tyro has printed the help, or what is wrong
+    except SystemExit as end:  # tyro has printed the help or the error
         return int(end.code or 0)
     except KeyboardInterrupt:
         print(f"Interrupted{_how_to_go_on(command)}", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # as by `| head`: nobody reads on
+    except BrokenPipeError:  # nobody reads the rest, for example after `| head`
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (for the interpreter's last flush)
         print(f"dqn-keras: nobody reads the output{_how_to_go_on(command)}", file=sys.stderr)
         return 141
@@ -172,14 +176,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _how_to_go_on(command: Any) -> str:
-    """What to add, if the run has begun."""
+    """Returns a hint on how to continue, if the run has begun."""
     folder = getattr(command, "folder", None) or getattr(command, "out", None)
     is_run = isinstance(command, Train | Resume) and folder is not None and (folder / "config.json").exists()
     return f". To go on: dqn-keras resume {shlex.quote(str(folder))}" if is_run else ""
 
 
 def _says_it_all(error: Exception) -> bool:
-    """Whether the message is enough; an error in an environment's own code (which has a note) needs its traceback."""
+    """Returns whether the message is enough; an error in an environment's code has a note and needs its traceback."""
     is_known = isinstance(error, ValueError | TypeError | OSError | ImportError)
     is_known |= type(error).__module__ == "gymnasium.error"
     return is_known and not hasattr(error, "__notes__")
@@ -191,5 +195,5 @@ def _error(message: str) -> int:
 
 
 def _in_plain_text(message: str) -> str:
-    """One line, without the colours of a terminal."""
+    """Returns the message in one line, without terminal colors."""
     return " ".join(re.sub(r"\x1b\[[0-9;]*m", "", message).split())

@@ -1,4 +1,4 @@
-"""The folder of a run of the command line: what is in it, and how a run begins there and goes on."""
+"""The folder of a run of the command line: its files, and how a run starts and continues there."""
 
 import ast
 import contextlib
@@ -29,7 +29,7 @@ from dqn_keras.training import Run, train
 
 @dataclasses.dataclass(frozen=True)
 class EnvOptions:
-    """What an environment is made from."""
+    """The options that an environment is made from."""
 
     id: str
     arguments: dict[str, Any]
@@ -38,7 +38,7 @@ class EnvOptions:
 
     @classmethod
     def parse(cls, id: str, arguments: Sequence[str], flatten: bool, compiled: bool) -> "EnvOptions":
-        """Of the command line's words; ValueError if there is no such functional twin, or a word is no assignment."""
+        """Reads the command line's words; ValueError if there is no functional twin or a word is not NAME=VALUE."""
         if compiled and (id not in environments.TWINS or arguments or flatten):
             raise ValueError(
                 f"compiled episodes are for {', '.join(environments.TWINS)} as they are, without arguments or flatten, "
@@ -56,13 +56,13 @@ class EnvOptions:
         return cls(id, values, flatten, compiled)
 
     def make(self, render_mode: str | None = None) -> gym.Env:
-        """The Gymnasium environment."""
-        rendering: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}  # not known to all
+        """Makes the Gymnasium environment."""
+        rendering: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}  # not all know it
         try:
             env = gym.make(self.id, **rendering, **self.arguments)
         except (gym.error.Error, ImportError):
             raise
-        except Exception as error:  # of the environment's own, about arguments that it does not take
+        except Exception as error:  # in the environment's code, about an argument that it does not take
             arguments = "".join(f" {name}={value!r}" for name, value in self.arguments.items())
             raise ValueError(f"{self.id}{arguments} cannot be made: {type(error).__name__}: {error}") from error
         if self.flatten:
@@ -73,13 +73,13 @@ class EnvOptions:
         return env
 
     def make_for_training(self) -> Any:
-        """The same, or its functional twin."""
+        """Makes the Gymnasium environment, or its functional twin if episodes are compiled."""
         return environments.TWINS[self.id]() if self.compiled else self.make()
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What config.json holds."""
+    """The contents of config.json."""
 
     env: EnvOptions
     seed: int
@@ -88,7 +88,7 @@ class Settings:
 
 
 def write_settings(folder: Path, settings: Settings) -> None:
-    """Write config.json, with the versions that the run is made with."""
+    """Writes config.json, together with the software versions of the run."""
     content = {
         "environment": dataclasses.asdict(settings.env),
         "seed": settings.seed,
@@ -101,7 +101,7 @@ def write_settings(folder: Path, settings: Settings) -> None:
 
 
 def read_settings(folder: Path) -> Settings:
-    """Read config.json; an error that says if there is none, or what is wrong in it."""
+    """Reads config.json; raises an error if there is none or if something in it is wrong."""
     path = folder / "config.json"
     if not path.exists():
         raise FileNotFoundError(f"{folder} holds no run: there is no config.json in it")
@@ -115,7 +115,7 @@ def read_settings(folder: Path) -> Settings:
 
 
 def read_q_network(folder: Path) -> keras.Model:
-    """The network of a run that has ended."""
+    """Loads the network of a run that has ended."""
     if not (folder / "agent.keras").exists():
         raise FileNotFoundError(
             f"{folder} has no agent.keras: its run is going on, or was killed, and dqn-keras resume {folder} goes on"
@@ -124,20 +124,20 @@ def read_q_network(folder: Path) -> keras.Model:
 
 
 def begin(folder: Path, settings: Settings, verbose: int) -> Run:
-    """Train in a folder that holds no run yet."""
+    """Starts a run in a folder that holds none yet."""
     if (folder / "config.json").exists():
         raise ValueError(
             f"{folder} holds a run already: `dqn-keras resume {folder}` goes on with it, another --out begins anew"
         )
     env = settings.env.make_for_training()
-    check_environment(env)  # before there is a folder
+    check_environment(env)  # before the folder is made
     folder.mkdir(parents=True, exist_ok=True)
     write_settings(folder, settings)
     return _train(folder, env, settings, verbose, resume=False)
 
 
 def resume(folder: Path, num_episodes: int | None, verbose: int) -> Run:
-    """Go on with a run, or with more episodes than it was to have."""
+    """Continues a run, with another maximum number of episodes if `num_episodes` is given."""
     before = settings = read_settings(folder)
     if num_episodes is not None:
         config = dataclasses.replace(settings.config, num_episodes=num_episodes)
@@ -158,7 +158,7 @@ def _train(folder: Path, env: Any, settings: Settings, verbose: int, resume: boo
     except filelock.Timeout:
         raise ValueError(f"{folder} is in use: another process trains there") from None
     with lock:
-        if log.exists():  # a kill may have torn its last line
+        if log.exists():  # a kill may have cut off its last line
             content = log.read_bytes()
             log.write_bytes(content[: content.rfind(b"\n") + 1])
         callbacks = [keras.callbacks.CSVLogger(log, append=True)]
@@ -180,7 +180,7 @@ def _train(folder: Path, env: Any, settings: Settings, verbose: int, resume: boo
 
 
 def _write_log(log: Path, history: dict[str, list[float]]) -> None:
-    """Writes log.csv as keras.callbacks.CSVLogger does, from what the checkpoint keeps: without repeats or gaps."""
+    """Writes log.csv as keras.callbacks.CSVLogger does, but without repeats or gaps, from the run's whole history."""
     names = sorted(history)
     with replacing(log) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -189,18 +189,18 @@ def _write_log(log: Path, history: dict[str, list[float]]) -> None:
 
 
 def read_log(folder: Path) -> dict[str, list[float]]:
-    """Returns what log.csv holds, as `run.history`; of an episode that was played again after a kill, the last row."""
+    """Returns log.csv in the form of `run.history`. An episode played twice, after a kill, counts with its last row."""
     rows: dict[int, dict[str, float]] = {}
     if (folder / "log.csv").exists():
         with (folder / "log.csv").open(newline="") as file:
             for row in csv.DictReader(file):
-                with contextlib.suppress(KeyError, TypeError, ValueError):  # the last may not be whole yet
+                with contextlib.suppress(KeyError, TypeError, ValueError):  # the last row may be incomplete
                     rows[int(row["epoch"])] = {name: float(row[name]) for name in LOGGED}
     return {name: [rows[episode][name] for episode in sorted(rows)] for name in LOGGED}
 
 
 def draw(folder: Path) -> Path:
-    """Draw study.png or curve.png, from what the folder holds."""
+    """Draws study.png or curve.png from the files in the folder, and returns its path."""
     if (folder / "study.npz").exists():
         axes, path = plot_study(load_study(folder / "study.npz"), published=None), folder / "study.png"
     else:

@@ -16,10 +16,10 @@ DT = 0.2  # s, one step
 
 
 class Acrobot(FuncEnv):
-    """A double pendulum driven at its elbow. The state, [4] float64: both angles, both angular velocities.
+    """A double pendulum with a motor at its elbow. State, [4] float64: both angles, both angular velocities.
 
-    Every step gives a reward of -1 but the last, which gives 0: the episode terminates when the tip is one length
-    above the joint, and is truncated after 500 steps.
+    The episode terminates when the tip is one length above the joint, and is truncated after 500 steps. Every step
+    gives a reward of -1, except the step that terminates, which gives 0.
     """
 
     _high = np.array([1, 1, 1, 1, *MAX_VELOCITIES], np.float32)
@@ -28,11 +28,11 @@ class Acrobot(FuncEnv):
     max_episode_steps = 500
 
     def initial(self, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """All four numbers uniform in [-0.1, 0.1)."""
+        """Returns a start state: all four numbers uniform in [-0.1, 0.1)."""
         return tf.cast(tf.random.stateless_uniform([4], rng, -0.1, 0.1, alg="philox"), tf.float64)
 
     def transition(self, state: tf.Tensor, action: tf.Tensor, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """One Runge-Kutta step of fourth order under a torque of -1 (0), 0 (1) or 1 (2) N m."""
+        """Returns the next state: a fourth-order Runge-Kutta step with a torque of -1 (0), 0 (1) or 1 (2) N m."""
         torque = tf.cast(action - 1, tf.float64)
         k1 = _derivative(state, torque)
         k2 = _derivative(state + DT / 2 * k1, torque)
@@ -44,18 +44,18 @@ class Acrobot(FuncEnv):
         return tf.concat([angles, tf.clip_by_value(state[2:], -limits, limits)], axis=0)
 
     def observation(self, state: tf.Tensor, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """Cosine and sine of both angles, and both velocities, [6] float32."""
+        """Returns cosine and sine of the first angle, then of the second, and both velocities, [6] float32."""
         cos, sin = tf.cos(state[:2]), tf.sin(state[:2])
         return tf.cast(tf.stack([cos[0], sin[0], cos[1], sin[1], state[2], state[3]]), tf.float32)
 
     def reward(
         self, state: tf.Tensor, action: tf.Tensor, next_state: tf.Tensor, rng: tf.Tensor, params: Any = None
     ) -> tf.Tensor:
-        """-1, and 0 for the step that reaches the height."""
+        """Returns -1, or 0 for the step that reaches the height."""
         return tf.where(self.terminal(next_state, rng), 0.0, -1.0)
 
     def terminal(self, state: tf.Tensor, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """Whether the tip is high enough."""
+        """Returns whether the tip is high enough."""
         return -tf.cos(state[0]) - tf.cos(state[0] + state[1]) > 1.0
 
 

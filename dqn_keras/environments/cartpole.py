@@ -21,10 +21,10 @@ MAX_POSITION = 2.4  # m
 
 
 class CartPole(FuncEnv):
-    """A pole on a cart. The state, [4] float64: position, velocity, angle, angular velocity.
+    """A pole on a cart. State, [4] float64: position, velocity, angle, angular velocity.
 
-    Every step gives a reward of 1; the episode terminates where the pole leans more than 12 degrees or the cart
-    is more than 2.4 m off the middle, and is truncated after 500 steps.
+    Every step gives a reward of 1. The episode terminates when the pole leans more than 12 degrees or the cart is more
+    than 2.4 m from the middle, and is truncated after 500 steps.
     """
 
     _high = np.array([2 * MAX_POSITION, np.inf, 2 * MAX_ANGLE, np.inf], np.float32)
@@ -33,11 +33,11 @@ class CartPole(FuncEnv):
     max_episode_steps = 500
 
     def initial(self, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """All four numbers uniform in [-0.05, 0.05)."""
+        """Returns a start state: all four numbers uniform in [-0.05, 0.05)."""
         return tf.random.stateless_uniform([4], rng, -0.05, 0.05, tf.float64, alg="philox")
 
     def transition(self, state: tf.Tensor, action: tf.Tensor, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """One Euler step under a push to the left (0) or to the right (1)."""
+        """Returns the next state: one Euler step with a push to the left (0) or to the right (1)."""
         _, velocity, angle, angular_velocity = tf.unstack(state)
         force = tf.where(action == 1, tf.constant(FORCE, tf.float64), -FORCE)
         cos, sin = tf.cos(angle), tf.sin(angle)
@@ -49,15 +49,15 @@ class CartPole(FuncEnv):
         return state + TAU * tf.stack([velocity, acceleration, angular_velocity, angular_acceleration])
 
     def observation(self, state: tf.Tensor, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """The state in float32."""
+        """Returns the state in float32."""
         return tf.cast(state, tf.float32)
 
     def reward(
         self, state: tf.Tensor, action: tf.Tensor, next_state: tf.Tensor, rng: tf.Tensor, params: Any = None
     ) -> tf.Tensor:
-        """1, also for the step that ends the episode."""
+        """Returns 1, also for the step that ends the episode."""
         return tf.constant(1.0)
 
     def terminal(self, state: tf.Tensor, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """Whether the cart has left the track or the pole has fallen."""
+        """Returns whether the cart has left the track or the pole has fallen."""
         return (tf.abs(state[0]) > MAX_POSITION) | (tf.abs(state[2]) > MAX_ANGLE)

@@ -14,9 +14,9 @@ FORCE, GRAVITY = 0.001, 0.0025
 
 
 class MountainCar(FuncEnv):
-    """A car too weak for its hill. The state, [2] float64: position, velocity.
+    """A car that is too weak for its hill. State, [2] float64: position, velocity.
 
-    Every step gives a reward of -1; the episode terminates on the hill and is truncated after 200 steps.
+    Every step gives a reward of -1. The episode terminates on the hill, and is truncated after 200 steps.
     """
 
     observation_space = spaces.Box(
@@ -26,12 +26,12 @@ class MountainCar(FuncEnv):
     max_episode_steps = 200
 
     def initial(self, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """At rest, the position uniform in [-0.6, -0.4)."""
+        """Returns a start state: at rest, with a position uniform in [-0.6, -0.4)."""
         position = tf.random.stateless_uniform([], rng, -0.6, -0.4, tf.float64, alg="philox")
         return tf.stack([position, tf.constant(0.0, tf.float64)])
 
     def transition(self, state: tf.Tensor, action: tf.Tensor, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """One step with the engine to the left (0), off (1) or to the right (2)."""
+        """Returns the next state: one step with the engine to the left (0), off (1) or to the right (2)."""
         position, velocity = tf.unstack(state)
         velocity += tf.cast(action - 1, tf.float64) * FORCE - GRAVITY * tf.cos(3 * position)
         velocity = tf.clip_by_value(velocity, -MAX_SPEED, MAX_SPEED)
@@ -40,15 +40,15 @@ class MountainCar(FuncEnv):
         return tf.stack([position, tf.where(is_at_wall, tf.constant(0.0, tf.float64), velocity)])
 
     def observation(self, state: tf.Tensor, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """The state in float32."""
+        """Returns the state in float32."""
         return tf.cast(state, tf.float32)
 
     def reward(
         self, state: tf.Tensor, action: tf.Tensor, next_state: tf.Tensor, rng: tf.Tensor, params: Any = None
     ) -> tf.Tensor:
-        """-1."""
+        """Returns -1."""
         return tf.constant(-1.0)
 
     def terminal(self, state: tf.Tensor, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """Whether the car is at the goal, not rolling back."""
+        """Returns whether the car is at the goal and does not roll back."""
         return (state[0] >= GOAL) & (state[1] >= 0)
