@@ -186,7 +186,7 @@ def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(number, code):
         _, said = process.communicate()
     assert process.returncode == code
     if code == 130:
-        assert said == "Interrupted; what there is has been kept. To go on: dqn-keras resume run\n"
+        assert said == "Interrupted; the finished part is saved. To continue: dqn-keras resume run\n"
         assert {"agent.keras", "curve.png"} <= {path.name for path in Path("run").iterdir()}
         assert [int(row["epoch"]) for row in log("run")] == list(range(len(log("run"))))
     else:
@@ -269,9 +269,9 @@ def test_folders_that_are_not_whole_are_told(capfd):
     hear("plot a")
     Path("a/config.json").write_text('{"seed": 3}')
     hear("evaluate a")
-    assert told[0].startswith("dqn-keras: a holds a run already: `dqn-keras resume a` goes on with it")
+    assert told[0].startswith("dqn-keras: a already holds a run: `dqn-keras resume a` continues it")
     assert told[1].startswith(
-        "dqn-keras: a has no agent.keras: its run is going on, or was killed, and dqn-keras resume"
+        "dqn-keras: a has no agent.keras: its run is in progress or was killed; to continue it: dqn-keras resume"
     )
     assert told[2] == "dqn-keras: a has no episode in log.csv yet\n"
     assert told[3].startswith("dqn-keras: a/config.json is not as `dqn-keras train` writes it: 'config'")
@@ -308,7 +308,7 @@ def test_nobody_reading_is_no_traceback():
     )
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True)
     assert done.stdout.count("\n") == 1
-    assert done.stderr == "dqn-keras: nobody reads the output. To go on: dqn-keras resume a\n"
+    assert done.stderr == "dqn-keras: nobody reads the output. To continue: dqn-keras resume a\n"
 
 
 def test_an_error_in_the_environments_own_code_keeps_its_traceback():

@@ -114,7 +114,7 @@ def _tell(run: Run, folder: Path, quiet: bool) -> int:
 
 
 def _interrupted(how: str) -> int:
-    print(f"Interrupted; what there is has been kept. To go on: {how}", file=sys.stderr)
+    print(f"Interrupted; the finished part is saved. To continue: {how}", file=sys.stderr)
     return 130
 
 

@@ -179,7 +179,7 @@ def _how_to_go_on(command: Any) -> str:
     """Returns a hint on how to continue, if the run has begun."""
     folder = getattr(command, "folder", None) or getattr(command, "out", None)
     is_run = isinstance(command, Train | Resume) and folder is not None and (folder / "config.json").exists()
-    return f". To go on: dqn-keras resume {shlex.quote(str(folder))}" if is_run else ""
+    return f". To continue: dqn-keras resume {shlex.quote(str(folder))}" if is_run else ""
 
 
 def _says_it_all(error: Exception) -> bool:

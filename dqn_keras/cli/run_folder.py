@@ -118,7 +118,8 @@ def read_q_network(folder: Path) -> keras.Model:
     """Loads the network of a run that has ended."""
     if not (folder / "agent.keras").exists():
         raise FileNotFoundError(
-            f"{folder} has no agent.keras: its run is going on, or was killed, and dqn-keras resume {folder} goes on"
+            f"{folder} has no agent.keras: its run is in progress or was killed; to continue it: "
+            f"dqn-keras resume {folder}"
         )
     return load_q_network(folder / "agent.keras")
 
@@ -127,7 +128,7 @@ def begin(folder: Path, settings: Settings, verbose: int) -> Run:
     """Starts a run in a folder that holds none yet."""
     if (folder / "config.json").exists():
         raise ValueError(
-            f"{folder} holds a run already: `dqn-keras resume {folder}` goes on with it, another --out begins anew"
+            f"{folder} already holds a run: `dqn-keras resume {folder}` continues it, another --out starts a new one"
         )
     env = settings.env.make_for_training()
     check_environment(env)  # before the folder is made

@@ -110,7 +110,7 @@ class Checkpoints:
                     f"num_episodes must be at least {len(agent.episodes)}, as many as {path} has, got {num_episodes}"
                 )
             if damaged:
-                warnings.warn(f"{'; '.join(damaged)}. The run goes on from the older {path}", stacklevel=4)
+                warnings.warn(f"{'; '.join(damaged)}. The run continues from the older {path}", stacklevel=4)
             warn_of_other_versions(path, facts, self._identity, stacklevel=5)
             self._kept = [path]
             return path

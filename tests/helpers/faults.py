@@ -216,7 +216,7 @@ def corruption_campaign(folder, number, seed=0):
             warnings.simplefilter("always")
             path = Checkpoints(source, identity(env, config, agent)).restore(agent, SEED)
         said = [str(w.message) for w in caught]
-        is_told = len(said) == 1 and str(newest(source)) in said[0] and f"goes on from the older {older}" in said[0]
+        is_told = len(said) == 1 and str(newest(source)) in said[0] and f"continues from the older {older}" in said[0]
         restored = checkpoint._arrays(agent, [])
         is_older = all(np.array_equal(restored[k], v, equal_nan=True) for k, v in expected.items())
         if path != older or not is_told or not is_older:
