@@ -20,12 +20,12 @@ import tensorflow as tf
 from hypothesis import HealthCheck, given, settings
 
 from dqn_keras import Config, train
-from dqn_keras import metrics as metrics_module
 from dqn_keras._engine.programs import _shared
 from dqn_keras.agent import make_agent
 from dqn_keras.checks.environments import CheckedEnv, check_functional
 from dqn_keras.environments import CartPole
 from dqn_keras.loops import compiled
+from dqn_keras.loops import updates as updates_module
 from dqn_keras.storage.checkpoint import Checkpoints
 from dqn_keras.storage.identity import identity
 from tests.helpers import faults
@@ -102,14 +102,14 @@ def cost_of_compiled_checks(rounds: int = 30) -> dict[str, str]:
     checks, config = compiled.is_all_finite, Config(num_episodes=10**6, epsilon=0.1, solved_reward=1e6)
     loops = []
     for is_all_finite in (checks, lambda *_: tf.constant(True)):
-        compiled.is_all_finite = metrics_module.is_all_finite = is_all_finite
+        compiled.is_all_finite = updates_module.is_all_finite = is_all_finite
         _shared.clear()
         agent = make_agent((4,), 2, config, 0)
         loop = compiled.episodes(CartPole(), check_functional(CartPole()), agent, config)
         while agent.memory.num_appended < 60_000:
             next(loop)
         loops.append((agent, loop))
-    compiled.is_all_finite = metrics_module.is_all_finite = checks
+    compiled.is_all_finite = updates_module.is_all_finite = checks
     costs = []
     for _ in range(rounds):
         turns = []

@@ -16,7 +16,7 @@ from dqn_keras.config import Config
 from dqn_keras.metrics import Episode
 from dqn_keras.networks import make_networks
 from dqn_keras.replay import ReplayMemory
-from dqn_keras.seeding import _derived
+from dqn_keras.seeding import acting_rng, weights_seed
 
 
 @dataclasses.dataclass
@@ -66,11 +66,11 @@ def make_agent(
     """
     sizes = (*state_shape, *config.hidden_units, num_actions)
     is_default = q_network is None and optimizer is None and loss == "mse"
-    learner = recycled(sizes, config.alpha, _derived(seed, 0)) if is_default else None
+    learner = recycled(sizes, config.alpha, weights_seed(seed)) if is_default else None
     if learner is None:
         if q_network is None:
             (num_features,) = state_shape
-            networks = make_networks(num_features, num_actions, config.hidden_units, _derived(seed, 0))
+            networks = make_networks(num_features, num_actions, config.hidden_units, weights_seed(seed))
         else:
             networks = q_network, copy(q_network, some_states)
             optimizer = optimizer or owners_optimizer(q_network)
@@ -82,7 +82,7 @@ def make_agent(
         q_hat_network=learner.q_hat_network,
         optimizer=learner.optimizer,
         memory=ReplayMemory(config.memory_size, state_shape, dtype),
-        rng=np.random.default_rng(_derived(seed, 1)),
+        rng=acting_rng(seed),
         epsilon=config.epsilon,
     )
 

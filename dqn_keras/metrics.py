@@ -3,14 +3,9 @@
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from dqn_keras._engine.programs import Learner
-from dqn_keras._engine.tensorflow import tf
-from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
-from dqn_keras.learn import Metrics, gradient_step
-from dqn_keras.replay import Experience
 
 
 class Episode(NamedTuple):
@@ -35,22 +30,6 @@ class Episode(NamedTuple):
     """Highest reward of a single step."""
     terminated: bool
     """Whether the environment terminated it; False after a time limit."""
-
-
-def checked_step(experiences: Experience, learner: Learner, gamma: Any, tau: Any, formulas: Formulas) -> Metrics:
-    """Takes a `gradient_step` and returns its metrics, with a loss of NaN if a weight is no longer finite."""
-    metrics = gradient_step(experiences, gamma, *learner, tau, formulas)
-    loss = tf.where(is_all_finite(*learner.q_network.weights), metrics.loss, math.nan)
-    return metrics._replace(loss=loss)
-
-
-def sum_up(metrics: Sequence[Metrics]) -> Metrics:
-    """Returns the means over an episode's updates, and the highest max_q; NaN if there are no updates."""
-    if not metrics:
-        return Metrics(*[math.nan] * len(Metrics._fields))
-    loss, mean_q, max_q, td_error = zip(*metrics, strict=True)
-    n = len(metrics)
-    return Metrics(sum(loss) / n, sum(mean_q) / n, max(max_q), sum(td_error) / n)
 
 
 LOGGED = {
@@ -119,9 +98,3 @@ def history(episodes: Sequence[Episode], config: Config, steps_per_second: Seque
     log = Log(config)
     rows = [log.add(*x) for x in zip(episodes, steps_per_second, strict=True)]
     return {name: [row[name] for row in rows] for name in LOGGED}
-
-
-def is_all_finite(*tensors: tf.Tensor) -> tf.Tensor:
-    """Returns whether all numbers are finite, as a boolean scalar; integers always are."""
-    floats = [x for x in map(tf.convert_to_tensor, tensors) if x.dtype.is_floating]
-    return tf.reduce_all([tf.reduce_all(tf.math.is_finite(x)) for x in floats])

@@ -30,6 +30,9 @@ class Experience(NamedTuple):
 class ReplayMemory:
     """The last `memory_size` transitions, in a ring buffer that is allocated once.
 
+    The loop of Gymnasium's environments uses `append` and `sample_rows`. Compiled episodes write and draw the same rows
+    inside their program (`loops/compiled.py`).
+
     One transition is one row: state, next_state, then action, reward and terminal_state as float32. So a batch is drawn
     and passed to TensorFlow as one array. float32 holds an action's index exactly up to 2^24.
 

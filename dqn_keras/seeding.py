@@ -12,6 +12,16 @@ def checked_seed(seed: int | None) -> int:
     return check_count("seed", seed, at_least=0)
 
 
+def weights_seed(seed: int) -> np.random.SeedSequence:
+    """Returns the seed of the initial weights."""
+    return _derived(seed, 0)
+
+
+def acting_rng(seed: int) -> np.random.Generator:
+    """Returns the generator of all random draws for acting and sampling in a gymnasium.Env."""
+    return np.random.default_rng(_derived(seed, 1))
+
+
 def episode_seed(seed: int, episode: int) -> int:
     """Returns the seed of `env.reset` for one episode of a run, so that any episode can be started again exactly."""
     return int(_derived(seed, 2, episode).generate_state(1)[0])

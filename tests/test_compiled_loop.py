@@ -12,14 +12,11 @@ from dqn_keras.agent import make_agent
 from dqn_keras.checks.environments import Spaces
 from dqn_keras.environments import CartPole
 from dqn_keras.loops.compiled import episodes
-from dqn_keras.loops.draws import draw_bits, episode_key, sample_indices, to_integer, to_uniform
+from dqn_keras.loops.draws import draw_bits, episode_key, reset_rng, sample_indices, to_integer, to_uniform
 from dqn_keras.policy import decay_epsilon
 from dqn_keras.replay import unpack
 from dqn_keras.seeding import draws_key
 from tests.helpers.runs import QUICK, SpoiledVelocity, Tape, fingerprint
-
-START = tf.constant(-(2**62), tf.int64)
-
 
 OTHERS = {
     "steps_per_update": 3,
@@ -55,7 +52,7 @@ def test_whole_episodes_replayed_in_gymnasium_agree(run, cartpole):
     for number, episode in enumerate(played):
         cartpole.reset(seed=0)
         key = episode_key(tf.constant(draws_key(0)), tf.constant(number))
-        cartpole.unwrapped.state = initial(tf.stack([key, START])).numpy()
+        cartpole.unwrapped.state = initial(reset_rng(key)).numpy()
         np.testing.assert_array_equal(episode.state[0], cartpole.unwrapped.state.astype(np.float32))
         for t, a in enumerate(episode.action):
             observation, reward, terminated, truncated, _ = cartpole.step(int(a))

@@ -12,7 +12,8 @@ from dqn_keras.checks.batches import as_batch
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.environments import Acrobot, CartPole
 from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, double_td_targets
-from dqn_keras.metrics import Episode, Log, checked_step, sum_up
+from dqn_keras.loops.updates import checked_step, sum_up
+from dqn_keras.metrics import Episode, Log
 from tests.helpers.environments import Corridor
 
 

@@ -1,4 +1,4 @@
-"""Detection of changes to the objects that a compiled program was traced from.
+"""A watch over the objects that `learn` was compiled for: has one of them changed since?
 
 A trace reads attributes, closures and global names once. `Watch` remembers their values: a comparison takes a few
 microseconds, while a new trace takes a second.

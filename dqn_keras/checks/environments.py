@@ -1,4 +1,4 @@
-"""Checks of environments: whether they are supported, and whether all that they return is valid and finite."""
+"""Checks of an environment's spaces, and of all that a gymnasium.Env returns; compiled episodes check their own."""
 
 import math
 from collections.abc import Callable

@@ -23,8 +23,9 @@ from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
 from dqn_keras.environments import TWINS
 from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, packages
-from dqn_keras.loops.draws import draw_bits, episode_key, sample_indices, to_integer, to_uniform
-from dqn_keras.metrics import Episode, checked_step, is_all_finite
+from dqn_keras.loops.draws import draw_bits, episode_key, reset_rng, sample_indices, step_rng, to_integer, to_uniform
+from dqn_keras.loops.updates import checked_step, is_all_finite
+from dqn_keras.metrics import Episode
 from dqn_keras.policy import decay_epsilon
 from dqn_keras.replay import Experience, pack, unpack
 from dqn_keras.seeding import draws_key
@@ -221,7 +222,7 @@ class _Loop:
 
     def _play_episode(self, key: tf.Tensor, epsilon: tf.Tensor) -> tuple[_Totals, tf.Tensor]:
         """Plays an episode -> its _Totals, and what was not finite in it, as an index of _FAULTS."""
-        rng = tf.stack([key, tf.constant(-(2**62), tf.int64)])
+        rng = reset_rng(key)
         state = self._env.initial(rng)
         observation = self._observation(state, rng)
         fault = tf.where(is_all_finite(observation), 0, 1)
@@ -244,7 +245,7 @@ class _Loop:
             state: Any, is_over: tf.Tensor, reward: tf.Tensor, most: tf.Tensor, t: tf.Tensor, *_: tf.Tensor
         ) -> tuple[Any, ...]:
             j = (t + n - 1) % n
-            rng = tf.stack([key, -1 - tf.cast(t, tf.int64)])
+            rng = step_rng(key, t)
             state, new_reward, terminated, fault = self._step(state, epsilon, bits[j], bits[n + j], rng)
             is_over = terminated | (t + 1 >= self._numbers.max_steps) | (fault > 0)
             reward, most = reward + tf.cast(new_reward, tf.float64), tf.maximum(most, new_reward)

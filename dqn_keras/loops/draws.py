@@ -52,3 +52,16 @@ _NEXT_ATTEMPT = 2**32  # larger than the number of any turn
 def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:
     """Returns the int64 number that determines all draws of an episode."""
     return tf.bitcast(draw_bits(2, key, episode), tf.int64)
+
+
+# The environment's own draws use negative counters, which no turn has.
+
+
+def reset_rng(key: tf.Tensor) -> tf.Tensor:
+    """Returns the seed of an episode's start state, [2] int64, for a functional environment's `initial`."""
+    return tf.stack([key, tf.constant(-(2**62), tf.int64)])
+
+
+def step_rng(key: tf.Tensor, step: tf.Tensor) -> tf.Tensor:
+    """Returns the seed of one step of the environment, [2] int64."""
+    return tf.stack([key, -1 - tf.cast(step, tf.int64)])

@@ -18,7 +18,8 @@ from dqn_keras.checks.environments import CheckedEnv
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
 from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, packages
-from dqn_keras.metrics import Episode, checked_step, sum_up
+from dqn_keras.loops.updates import checked_step, sum_up
+from dqn_keras.metrics import Episode
 from dqn_keras.policy import action, decay_epsilon
 from dqn_keras.replay import Experience, unpack
 from dqn_keras.seeding import episode_seed

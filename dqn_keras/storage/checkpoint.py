@@ -19,7 +19,7 @@ from dqn_keras.learn import Metrics
 from dqn_keras.metrics import Episode
 from dqn_keras.replay import unpack
 from dqn_keras.storage.files import FORMAT, DamagedError, from_bytes, replacing, to_bytes
-from dqn_keras.storage.identity import Identity, check_is_same
+from dqn_keras.storage.identity import MAY_CHANGE_ON_RESUME, Identity, check_is_same
 from dqn_keras.storage.versions import warn_of_other_versions
 
 
@@ -77,7 +77,9 @@ class Checkpoints:
     def save(self, agent: Agent) -> None:
         """Saves the state of `agent` at the end of an episode; raises OSError if the disk cannot be written."""
         path = self.folder / f"checkpoint-{len(agent.episodes):010d}.npz"
-        content = to_bytes(_arrays(agent, self._other_variables), {"format": FORMAT, **self._identity, **_facts(agent)})
+        content = to_bytes(
+            _arrays(agent, self._other_variables), {"format": FORMAT, **self._identity, **_counters(agent)}
+        )
         self.folder.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary:
             temporary.write_bytes(content)
@@ -97,9 +99,8 @@ class Checkpoints:
         for path in self.paths():
             try:
                 arrays, facts = from_bytes(path.read_bytes())
-                check_facts(facts, self._identity | _facts(agent))
-                changeable = ["num_episodes"] if seed is not None else ["num_episodes", "seed"]
-                check_is_same(path, facts, {**self._identity, "seed": seed}, but_for=changeable)
+                check_facts(facts, self._identity | _counters(agent))
+                check_is_same(path, facts, {**self._identity, "seed": seed}, MAY_CHANGE_ON_RESUME)
                 _restore(agent, self._other_variables, arrays, facts)
             except (DamagedError, OSError) as error:
                 damaged.append(f"{path} cannot be used: {error}")
@@ -135,11 +136,11 @@ def _variables(agent: Agent, others: Sequence[tf.Variable]) -> dict[str, keras.V
     return {f"{owner}/{i}": variable for owner, variables in owners.items() for i, variable in enumerate(variables)}
 
 
-def _facts(agent: Agent) -> dict[str, Any]:
+def _counters(agent: Agent) -> dict[str, Any]:
     """Returns the rest of the state, as JSON values."""
     return {
         "seed": agent.seed,
-        "num_episodes": len(agent.episodes),
+        "episodes_played": len(agent.episodes),
         "num_appended": agent.memory.num_appended,
         "num_updates": agent.num_updates,
         "epsilon": agent.epsilon,
@@ -156,14 +157,14 @@ def check_facts(facts: dict[str, Any], expected: dict[str, Any]) -> None:
 
 def _restore(agent: Agent, others: Sequence[tf.Variable], arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
     """Puts a new agent into a saved state; raises DamagedError, before any change, if the state does not fit."""
-    num_episodes, num_appended, epsilon = facts["num_episodes"], facts["num_appended"], facts["epsilon"]
+    episodes_played, num_appended, epsilon = facts["episodes_played"], facts["num_appended"], facts["epsilon"]
     rng = np.random.default_rng(0)
     try:
         rng.bit_generator.state = facts["rng"]
     except (KeyError, TypeError, ValueError) as error:
         raise DamagedError(f"rng is wrong in it: {error!r}") from None
     expected = _arrays(agent, others)
-    expected |= {f"episodes/{name}": np.zeros(max(0, num_episodes), dtype) for name, dtype in _COLUMNS.items()}
+    expected |= {f"episodes/{name}": np.zeros(max(0, episodes_played), dtype) for name, dtype in _COLUMNS.items()}
     expected["memory"] = agent.memory.rows[:num_appended]
     # A run continues if one of Adam's averages overflows, as long as the weights are finite.
     may_be_infinite = {f"episodes/{name}" for name in Metrics._fields} | {

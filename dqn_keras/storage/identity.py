@@ -116,10 +116,18 @@ def _traceable(agent: Agent, config: Config, formulas: Formulas) -> dict[str, tu
     }
 
 
-def check_is_same(path: Path, theirs: dict[str, Any], ours: dict[str, Any], but_for: Sequence[str] = ()) -> None:
-    """Raises ValueError if `path` is from another run; the message begins with the argument or field that differs."""
+MAY_CHANGE_ON_RESUME = ("num_episodes",)
+"""The fields of Config that may differ when a run is resumed. Never compared: callbacks, checkpoint_every, verbose."""
+
+
+def check_is_same(path: Path, theirs: dict[str, Any], ours: dict[str, Any], may_change: Sequence[str] = ()) -> None:
+    """Raises ValueError if `path` is from another run; the message begins with the argument or field that differs.
+
+    The seeds are compared if `ours` has one.
+    """
     numbers, our_numbers = ({**x["config"], "seed": x.get("seed")} for x in (theirs, ours))
-    for name in [name for name in our_numbers if name not in but_for]:
+    may_change = may_change if our_numbers["seed"] is not None else (*may_change, "seed")
+    for name in [name for name in our_numbers if name not in may_change]:
         if name not in numbers or numbers[name] != our_numbers[name]:
             raise ValueError(f"{name} is {numbers.get(name)!r} in {path}, got {our_numbers[name]!r}")
     can_compare = all(theirs["versions"].get(x) == ours["versions"][x] for x in ("dqn_keras", "tensorflow", "keras"))

@@ -192,7 +192,7 @@ def forged(content, rng):
     elif way == "missing fact":
         del facts[rng.choice(sorted(facts.keys()))]
     else:
-        facts[rng.choice(["num_episodes", "num_appended"])] += rng.choice([-1, 1])
+        facts[rng.choice(["episodes_played", "num_appended"])] += rng.choice([-1, 1])
     return way, to_bytes(arrays, facts)
 
 
@@ -236,7 +236,7 @@ def forgetting_campaign(loop, folder):
     play(loop, folder / "half", config=half)
     arrays, facts = from_bytes(newest(folder / "half").read_bytes())
     fresh = make_agent((4,), 2, run.config, SEED)
-    start_arrays, start_facts = checkpoint._arrays(fresh, []), checkpoint._facts(fresh)
+    start_arrays, start_facts = checkpoint._arrays(fresh, []), checkpoint._counters(fresh)
     start_facts["rng"] = np.random.default_rng(0).bit_generator.state
     start_facts["seed"] = 0
 
