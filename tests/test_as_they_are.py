@@ -100,6 +100,7 @@ def sgd():
     return keras.optimizers.SGD(0.1)
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 @pytest.mark.parametrize("change", LOSS_CHANGES)
 def test_train_sees_what_the_loss_reads(make_env, change, monkeypatch):
@@ -161,6 +162,7 @@ OBJECT_CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jit_compile", [True, False], ids=["jit", "no jit"])
 @pytest.mark.parametrize("change", OBJECT_CHANGES)
 def test_learn_sees_what_is_set_on_an_optimizer_or_a_layer(change, jit_compile, random_batch):
@@ -175,6 +177,7 @@ def test_learn_sees_what_is_set_on_an_optimizer_or_a_layer(change, jit_compile, 
     assert not all(map(np.array_equal, *results))
 
 
+@pytest.mark.slow
 def test_learn_sees_a_function_put_into_a_lambda_layer_and_a_recurrent_activation(random_batch):
     def with_lambda():
         return sequential(dense(8), keras.layers.Lambda(tf.sin))
@@ -201,6 +204,7 @@ def test_learn_sees_a_function_put_into_a_lambda_layer_and_a_recurrent_activatio
         assert value == pytest.approx(parts.eager_step(batch, 0.9, 0.01, theirs, their_hat, sgd()), rel=1e-4)
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 def test_train_sees_a_global_that_an_activation_reads(make_env, monkeypatch):
     def run():
@@ -240,6 +244,7 @@ class Drift(FuncEnv):
         return state > 8.0
 
 
+@pytest.mark.slow
 def test_train_sees_changes_of_a_functional_environment(monkeypatch):
     env = Drift()
 
@@ -265,6 +270,7 @@ class Typed(Drift):
         return state + float(7 // self.step if isinstance(self.step, int) else 7 / self.step)
 
 
+@pytest.mark.slow
 def test_a_whole_number_in_the_place_of_an_equal_float_is_another_environment(monkeypatch):
     next_states = [train(Typed(), QUICK, seed=0, verbose=0).agent.memory.rows[0, 1]]
     monkeypatch.setattr(Typed, "step", 2)
@@ -272,6 +278,7 @@ def test_a_whole_number_in_the_place_of_an_equal_float_is_another_environment(mo
     assert next_states == [3.5, 3.0]
 
 
+@pytest.mark.slow
 def test_another_gravity_is_seen_in_the_packages_own_cartpole(monkeypatch):
     before = train(CartPole(), QUICK, seed=0, verbose=0).agent.memory.rows.copy()
     monkeypatch.setattr(cartpole_module, "GRAVITY", 50.0)
@@ -292,6 +299,7 @@ def test_normalization_scales_in_acting_learning_and_q_hat():
     np.testing.assert_allclose(run.q_hat_network(far), network(far), rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_exclusions_from_weight_decay_hold_in_train():
     decaying = [keras.optimizers.AdamW(0.001, weight_decay=100.0) for _ in range(2)]
     decaying[1].exclude_from_weight_decay(var_names=["kernel", "bias"])
@@ -299,11 +307,13 @@ def test_exclusions_from_weight_decay_hold_in_train():
     assert norms[0] < 0.9 * norms[1]
 
 
+@pytest.mark.slow
 def test_an_own_optimizer_without_a_configuration_trains():
     assert np.isfinite(trained(optimizer=parts.SignDescent(2.0))).all()
     assert not np.array_equal(trained(optimizer=parts.SignDescent(2.0)), trained(optimizer=parts.SignDescent(0.1)))
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 def test_own_schedules_and_lambda_layers_train(make_env):
     network = sequential(dense(8), keras.layers.Lambda(lambda x: tf.sin(x)))
@@ -312,6 +322,7 @@ def test_own_schedules_and_lambda_layers_train(make_env):
     ).all()
 
 
+@pytest.mark.slow
 def test_a_learning_rate_that_is_a_python_function_is_called_once_and_that_is_said():
     with pytest.warns(UserWarning, match=r"the learning rate of 'sgd.*' is a Python function, .* it stays at 0.03"):
         trained(optimizer=keras.optimizers.SGD(lambda: 0.03))
@@ -368,6 +379,7 @@ def test_a_layer_that_cannot_be_made_again_is_refused_by_name():
 # Regularization, loss scaling, inference mode
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 def test_regularization_is_part_of_the_loss(make_env):
     norms = []
@@ -393,6 +405,7 @@ def test_one_warning_names_the_layers_that_differ_in_training(cartpole):
     assert len([w for w in told if "inference mode" in str(w.message)]) == 1
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 def test_after_a_run_with_ema_the_network_holds_the_averages_as_after_fit(make_env):
     optimizer = keras.optimizers.SGD(0.1, use_ema=True, ema_momentum=0.99)
@@ -407,6 +420,7 @@ def test_after_a_run_with_ema_the_network_holds_the_averages_as_after_fit(make_e
 # Optimizer, loss and targets: whose, and which
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 def test_a_compiled_network_brings_its_optimizer_and_loss(make_env):
     def network():
@@ -424,6 +438,7 @@ def test_a_compiled_network_brings_its_optimizer_and_loss(make_env):
     assert compiled.get_compile_config().keys() == config.keys()
 
 
+@pytest.mark.slow
 def test_arguments_win_over_what_a_network_was_compiled_with_and_callbacks_see_the_optimizer_in_use():
     network, optimizer, seen = NETWORKS["dense"](), sgd(), []
     network.compile(keras.optimizers.AdamW(3e-4), loss="huber")
@@ -435,6 +450,7 @@ def test_arguments_win_over_what_a_network_was_compiled_with_and_callbacks_see_t
     np.testing.assert_array_equal(ours, trained(q_network=NETWORKS["dense"](), optimizer=sgd(), loss="mae"))
 
 
+@pytest.mark.slow
 def test_a_network_that_train_compiled_itself_starts_the_next_run_with_a_new_adam():
     network = NETWORKS["dense"]()
     train(CartPole(), QUICK, seed=0, q_network=network, verbose=0)
@@ -514,6 +530,7 @@ def test_an_optimizer_of_another_run_is_refused(cartpole):
 # Double DQN
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 def test_double_targets_are_targets_of_ones_own_that_do_the_same(make_env):
     def by_hand(experiences, gamma, q_network, q_hat_network):
@@ -611,6 +628,7 @@ NUMBERS = [
 ]
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 def test_another_number_compiles_nothing_and_counts(make_env):
     first = trained(make_env)
@@ -622,6 +640,7 @@ def test_another_number_compiles_nothing_and_counts(make_env):
     assert (len(_shared), len(_compiled)) == num_programs
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 def test_runs_with_an_equal_loss_compile_once_and_leave_no_memory_behind(make_env):
     def run():
@@ -768,12 +787,14 @@ def test_a_compiled_network_with_a_list_of_losses_is_refused(cartpole):
         train(cartpole, QUICK, q_network=network, verbose=0)
 
 
+@pytest.mark.slow
 def test_another_reward_of_the_packages_cartpole_is_seen(monkeypatch):
     before = train(CartPole(), QUICK, seed=0, verbose=0).rewards
     monkeypatch.setattr(CartPole, "reward", lambda *_: tf.constant(7.0))
     np.testing.assert_array_equal(train(CartPole(), QUICK, seed=0, verbose=0).rewards, 7 * before)
 
 
+@pytest.mark.slow
 def test_a_function_of_the_users_can_still_be_differentiated_after_a_run():
     @tf.custom_gradient
     def clipped(x):
@@ -791,6 +812,7 @@ def test_a_function_of_the_users_can_still_be_differentiated_after_a_run():
     np.testing.assert_array_equal(tape.gradient(value, q), -np.ones(8))
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 def test_averages_are_the_networks_before_callbacks_hear_of_the_end(make_env, tmp_path):
     optimizer, seen, best = keras.optimizers.SGD(0.1, use_ema=True, ema_momentum=0.99), [], []
@@ -809,6 +831,7 @@ def test_averages_are_the_networks_before_callbacks_hear_of_the_end(make_env, tm
     assert all(map(np.array_equal, run.q_network.get_weights(), best[0]))
 
 
+@pytest.mark.slow
 def test_a_run_with_averages_and_callbacks_is_resumed_bit_for_bit(tmp_path):
     def run(num_episodes, **more):
         optimizer = keras.optimizers.SGD(0.1, use_ema=True, ema_momentum=0.9)
@@ -821,6 +844,7 @@ def test_a_run_with_averages_and_callbacks_is_resumed_bit_for_bit(tmp_path):
     np.testing.assert_array_equal(whole, run(9, checkpoint=tmp_path, resume=True))  # which has nothing left to do
 
 
+@pytest.mark.slow
 def test_a_network_is_compiled_with_the_loss_and_optimizer_that_it_learns_with(tmp_path):
     save = keras.callbacks.ModelCheckpoint(tmp_path / "network.keras")
     train(CartPole(), QUICK, 0, q_network=NETWORKS["dense"](), loss="huber", callbacks=save, verbose=0)

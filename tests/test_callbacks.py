@@ -30,6 +30,7 @@ def weights(run):
     return np.concatenate([w.ravel() for w in run.q_network.get_weights()])
 
 
+@pytest.mark.slow
 def test_the_history_is_what_keras_history_heard(env):
     heard = keras.callbacks.History()
     run = play(env, heard)
@@ -39,6 +40,7 @@ def test_the_history_is_what_keras_history_heard(env):
         np.testing.assert_array_equal(run.history[name], heard.history[name])
 
 
+@pytest.mark.slow
 def test_csv_logger_writes_the_history_and_changes_nothing(env, tmp_path):
     run = play(env, keras.callbacks.CSVLogger(tmp_path / "log.csv"))
     rows = list(csv.DictReader((tmp_path / "log.csv").open()))
@@ -111,12 +113,14 @@ def test_terminate_on_nan_ends_a_run_that_diverges(env, tmp_path):
         play(env, SpoiledVelocity())
 
 
+@pytest.mark.slow
 def test_terminate_on_nan_does_not_mind_the_episodes_before_the_first_update(env):
     run = play(env, keras.callbacks.TerminateOnNaN(), config=Config(num_episodes=30, batch_size=200))
     assert np.isnan(run.history["loss"][0])
     assert len(run.rewards) == 30
 
 
+@pytest.mark.slow
 def test_lambda_callbacks_hear_everything_in_keras_order(env):
     tape = []
     events = ("train_begin", "epoch_begin", "train_batch_begin", "train_batch_end", "epoch_end", "train_end")
@@ -142,6 +146,7 @@ def test_a_callback_may_change_the_network(env):
     assert other.history["mean_q"][20] < 0.5 < run.history["mean_q"][20]
 
 
+@pytest.mark.slow
 def test_one_callback_needs_no_list_and_what_is_none_is_refused(env):
     heard = keras.callbacks.History()
     train(env, Config(num_episodes=2, batch_size=2), seed=0, callbacks=heard, verbose=0)
@@ -150,6 +155,7 @@ def test_one_callback_needs_no_list_and_what_is_none_is_refused(env):
         train(env, callbacks=["log.csv"])
 
 
+@pytest.mark.slow
 def test_the_bar_stands_beside_the_originals_lines(env, capfd):
     config = Config(num_episodes=110, batch_size=16, solved_reward=1e6)
     play(env, config=config, verbose=1)

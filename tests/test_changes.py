@@ -192,6 +192,7 @@ def test_fit_predict_and_save_between_two_calls_do_not_compile_again(learning, t
     assert learning.num_compiled == 1
 
 
+@pytest.mark.slow
 def test_the_warning_of_many_compilations_says_what_has_changed(learning):
     held = SimpleNamespace(num_calls=0)
 

@@ -30,6 +30,7 @@ from tests.helpers.runs import Tape, fingerprint
 QUICK = dataclasses.replace(CONFIG, num_episodes=40)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", LOOPS)
 def test_a_run_resumed_three_times_ends_with_the_bits_of_one_that_was_not(loop, tmp_path):
     whole = train(LOOPS[loop](), QUICK, SEED, verbose=0)
@@ -42,6 +43,7 @@ def test_a_run_resumed_three_times_ends_with_the_bits_of_one_that_was_not(loop, 
     assert final_bits(tmp_path / "resumed") == final_bits(tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_killed_runs_end_with_the_bits_of_one_that_was_not(tmp_path):
     figures = faults.kill_campaign(tmp_path, num_kills=8, num_in_saves=4, kills_per_run=4)
     assert figures["kills"] == 8
@@ -49,12 +51,14 @@ def test_killed_runs_end_with_the_bits_of_one_that_was_not(tmp_path):
     assert figures["differing runs"] == 0
 
 
+@pytest.mark.slow
 def test_runs_that_are_asked_to_stop_stop_and_go_on_to_the_same_bits(tmp_path):
     figures = faults.signal_campaign(tmp_path, 4)
     assert figures["runs stopped by them"] > 0
     assert figures["differing runs"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", LOOPS)
 def test_no_part_of_a_checkpoint_can_be_forgotten(loop, tmp_path):
     outcomes = faults.forgetting_campaign(loop, tmp_path)
@@ -65,6 +69,7 @@ def test_no_part_of_a_checkpoint_can_be_forgotten(loop, tmp_path):
     assert all(reset in ("refused", "other bits") for _, reset in outcomes.values()), outcomes
 
 
+@pytest.mark.slow
 def test_a_corrupted_checkpoint_gives_way_to_the_older_one_and_that_is_said(tmp_path):
     figures = faults.corruption_campaign(tmp_path, 300)
     assert figures["corruptions"] > 250
@@ -72,6 +77,7 @@ def test_a_corrupted_checkpoint_gives_way_to_the_older_one_and_that_is_said(tmp_
     assert figures["silent"] == []
 
 
+@pytest.mark.slow
 def test_if_no_checkpoint_is_whole_the_error_says_why_of_each(tmp_path):
     play("compiled episodes", tmp_path, QUICK)
     paths = sorted(tmp_path.iterdir())
@@ -82,6 +88,7 @@ def test_if_no_checkpoint_is_whole_the_error_says_why_of_each(tmp_path):
         play("compiled episodes", tmp_path, QUICK)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -347,6 +354,7 @@ def test_training_works_in_a_thread(cartpole):
     assert len(runs[0].episodes) == 40
 
 
+@pytest.mark.slow
 def test_an_interrupted_notebook_cell_hands_back_the_run():
     from jupyter_client.manager import start_new_kernel
 
@@ -391,6 +399,7 @@ for loop in LOOPS:
 """
 
 
+@pytest.mark.slow
 def test_fresh_processes_with_other_threads_and_hash_seeds_give_the_same_bits(tmp_path):
     results = set()
     for threads, hash_seed in [(1, 0), (2, 1), (2, 2)]:

@@ -55,6 +55,7 @@ assert not {"tensorflow", "keras", "gymnasium", "matplotlib"} & sys.modules.keys
         assert word in done.stdout
 
 
+@pytest.mark.slow
 def test_the_installed_command_and_the_module_are_the_same():
     commands = [[Path(sys.executable).with_name("dqn-keras")], [sys.executable, "-m", "dqn_keras"]]
     first, second = (subprocess.run([*x, "plot", "nowhere"], capture_output=True, text=True) for x in commands)
@@ -62,6 +63,7 @@ def test_the_installed_command_and_the_module_are_the_same():
     assert first.stderr == second.stderr == "dqn-keras: nowhere holds no run: there is no config.json in it\n"
 
 
+@pytest.mark.slow
 def test_a_run_folder_holds_what_one_expects():
     assert dqn_keras(f"train CartPole-v1 --seed 3 --tau 0.005 --hidden-units 8 4 --out runs/a {SHORT}") == 0
     names = {path.name for path in Path("runs/a").iterdir()}
@@ -79,6 +81,7 @@ def test_a_run_folder_holds_what_one_expects():
         assert picture.width > 1000
 
 
+@pytest.mark.slow
 def test_compiled_episodes_are_those_of_the_functional_twin():
     assert dqn_keras(f"train CartPole-v1 --seed 3 --compiled --tensorboard {SHORT}") == 0
     config = Config(num_episodes=12, batch_size=16, solved_reward=1000)
@@ -100,6 +103,7 @@ def test_the_agent_is_evaluated_and_watched(capsys):
         assert picture.is_animated
 
 
+@pytest.mark.slow
 def test_the_agent_is_watched_in_a_window_where_there_is_a_display(capsys, monkeypatch):
     dqn_keras(f"train FrozenLake-v1 --flatten --seed 0 --out a {SHORT}")
     made, make = [], gym.make
@@ -126,6 +130,7 @@ def test_a_real_window_opens(capsys):
     assert done.stdout.startswith("1 greedy episodes: mean return")
 
 
+@pytest.mark.slow
 def test_environments_take_arguments_and_wrappers(tmp_path):
     line = f"train FrozenLake-v1 --flatten --env-args is_slippery=False map_name=8x8 --seed 0 --out a {SHORT}"
     assert dqn_keras(line) == 0
@@ -139,6 +144,7 @@ def test_environments_take_arguments_and_wrappers(tmp_path):
     assert Path("runs/my_environments-Corridor-v0-1/agent.keras").exists()
 
 
+@pytest.mark.slow
 def test_a_study_is_kept_gone_on_with_and_drawn(capsys):
     line = "study CartPole-v1 --compiled --out s --workers 1 --num-episodes 60 --solved-reward 10 --quiet"
     assert dqn_keras(f"{line} --seeds 2") == 0
@@ -150,6 +156,7 @@ def test_a_study_is_kept_gone_on_with_and_drawn(capsys):
     assert Path("s/study.png").exists()
 
 
+@pytest.mark.slow
 def test_a_longer_run_is_the_run_that_had_been_longer_from_the_start():
     dqn_keras(f"train CartPole-v1 --seed 3 --out whole {SHORT}")
     dqn_keras(f"train CartPole-v1 --seed 3 --out parts {SHORT} --num-episodes 7")
@@ -172,6 +179,7 @@ def differing(*folders):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)]
 )
@@ -277,6 +285,7 @@ def test_folders_that_are_not_whole_are_told(capfd):
     assert told[3].startswith("dqn-keras: a/config.json is not as `dqn-keras train` writes it: 'config'")
 
 
+@pytest.mark.slow
 def test_a_folder_is_for_one_process_at_a_time(capfd):
     dqn_keras(f"train CartPole-v1 --seed 3 --out a {SHORT}")
     with filelock.FileLock("a/.lock"):
@@ -285,6 +294,7 @@ def test_a_folder_is_for_one_process_at_a_time(capfd):
     assert dqn_keras("resume a --quiet") == 0
 
 
+@pytest.mark.slow
 def test_a_log_that_was_lost_or_damaged_is_made_again():
     dqn_keras(f"train CartPole-v1 --seed 3 --out a {SHORT}")
     whole = log("a")
@@ -302,6 +312,7 @@ def test_a_longer_run_that_is_refused_changes_nothing():
     assert {path: path.read_bytes() for path in Path("a").rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.slow
 def test_nobody_reading_is_no_traceback():
     script = (
         f"{shlex.quote(sys.executable)} -m dqn_keras train CartPole-v1 --seed 3 --out a --num-episodes 500 | head -1"

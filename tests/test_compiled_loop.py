@@ -45,6 +45,7 @@ def transitions(run):
     return [type(batch)(*(field[i:j] for field in batch)) for i, j in zip([0, *ends], ends, strict=False)]
 
 
+@pytest.mark.slow
 def test_whole_episodes_replayed_in_gymnasium_agree(run, cartpole):
     played = transitions(run)
     assert len(played) == 120
@@ -63,6 +64,7 @@ def test_whole_episodes_replayed_in_gymnasium_agree(run, cartpole):
         assert run.episodes[number].reward == episode.reward.sum()
 
 
+@pytest.mark.slow
 def test_its_draws_actions_and_updates_replayed_step_by_step_through_learn_agree(run):
     config, agent = run.config, make_agent((4,), 2, run.config, 0)
     rows, num_steps, epsilon, updates = run.agent.memory.rows, 0, config.epsilon, 0
@@ -93,6 +95,7 @@ def test_its_draws_actions_and_updates_replayed_step_by_step_through_learn_agree
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [64, 65, 100, 5_000])
 def test_a_batch_has_no_repeats_and_is_uniform(size):
     @tf.function(jit_compile=True)
@@ -114,6 +117,7 @@ def test_a_batch_has_no_repeats_and_is_uniform(size):
     assert stats.chisquare(np.bincount(batches[:, -1], minlength=size)).pvalue > 1e-4
 
 
+@pytest.mark.slow
 def test_draws_are_uniform_and_differ_from_turn_to_turn_and_episode_to_episode():
     keys = [episode_key(tf.constant(draws_key(seed)), tf.constant(k)) for seed in (0, 1) for k in range(50)]
     bits = np.array([draw_bits(72, key, turn) for key in keys for turn in range(4)])
@@ -139,6 +143,7 @@ def test_one_seed_gives_the_same_bits_however_many_episodes_a_call_plays():
     assert prints[0] == prints[1] == prints[2]
 
 
+@pytest.mark.slow
 def test_one_seed_gives_the_same_bits_in_another_process_and_another_seed_does_not(in_another_process):
     here = fingerprint(train(CartPole(), QUICK, seed=5, verbose=0))
     assert in_another_process("CartPole()", seed=5) == here
@@ -151,6 +156,7 @@ def test_an_agent_before_it_changes_nothing():
     assert fingerprint(train(CartPole(), QUICK, seed=1, verbose=0)) == alone
 
 
+@pytest.mark.slow
 def test_the_stop_rule_holds_after_each_episode_with_the_weights_of_that_moment():
     config = Config(solved_reward=30.0, solved_window=5)
     run = train(CartPole(), config, seed=0, verbose=0)
@@ -173,6 +179,7 @@ def test_callbacks_see_every_episode():
     assert run.agent.memory.num_appended == run.rewards.sum()
 
 
+@pytest.mark.slow
 def test_a_full_memory_forgets_the_oldest():
     run = train(CartPole(), Config(num_episodes=60, memory_size=200, solved_reward=1e9), seed=0, verbose=0)
     memory = run.agent.memory
@@ -207,6 +214,7 @@ class Counter(FuncEnv):
         return state["count"] >= 10
 
 
+@pytest.mark.slow
 def test_any_functional_environment_trains():
     run = train(Counter(), Config(num_episodes=20, solved_reward=1e9), seed=0, verbose=0)
     assert [e.steps for e in run.episodes] == [10] * 20
@@ -217,6 +225,7 @@ def test_any_functional_environment_trains():
     assert not short.agent.memory.rows[:, 4].any()  # left, not terminated
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_bad_number_stops_the_run_and_says_where(bad):
     for count, where in [(7.0, "step 6"), (0.0, "at the reset")]:
@@ -232,11 +241,13 @@ class Paying(Counter):
         return tf.where(next_state["count"] == 4, tf.constant(1e39, tf.float64), 1.0)
 
 
+@pytest.mark.slow
 def test_a_bad_reward_is_told_from_a_bad_observation():
     with pytest.raises(ValueError, match=r"^env Paying: a reward was not finite in episode 0, step 3"):
         train(Paying(), Config(num_episodes=20), seed=0, verbose=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make_env", [CartPole, lambda: gym.make("CartPole-v1")])
 def test_a_weight_that_becomes_nan_stops_the_run_in_the_same_update(make_env):
     with pytest.raises(ValueError, match=r"the loss or a weight (was|is) not finite in episode 12, step 0"):
@@ -250,6 +261,7 @@ class Noisy(Counter):
         return tf.cast(state["count"], tf.float32)[None] + tf.random.stateless_normal([1], rng)
 
 
+@pytest.mark.slow
 def test_a_random_observation_is_made_once_for_each_state():
     run = train(Noisy(), Config(num_episodes=20, solved_reward=1e9), seed=0, verbose=0)
     for episode in transitions(run):
@@ -288,6 +300,7 @@ def test_without_xla_the_error_says_what_works(monkeypatch, cartpole):
             train(env, config, seed=0, verbose=0)
 
 
+@pytest.mark.slow
 def test_resident_memory_stays_flat_over_a_million_steps():
     config = Config(num_episodes=100_000, solved_reward=1e9, epsilon=0.1)
     agent = make_agent((4,), 2, config, 0)

@@ -43,6 +43,7 @@ def test_an_episode_is_the_mean_of_its_updates_and_their_highest_q():
     assert all(math.isnan(x) for x in sum_up([]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make_env", [lambda: gym.make("CartPole-v1"), CartPole], ids=["Gymnasium", "compiled"])
 def test_the_terminal_share_is_that_of_the_memory(make_env):
     # With as many transitions as whole episodes: the memory's oldest may be of the middle of one, ended later or not.
@@ -78,6 +79,7 @@ def test_the_bound_is_the_highest_return_that_there_can_be(rewards, gamma, bound
     assert [log.add(episode(max_reward=r), 1.0)["q_bound"] for r in rewards] == pytest.approx(bounds)
 
 
+@pytest.mark.slow
 def test_both_loops_note_the_highest_reward_and_the_end():
     run = train(Corridor(length=9, limit=6, reward=lambda t: [0, 5, 1][t % 3]), Config(num_episodes=30), 0, verbose=0)
     assert {e.max_reward for e in run.episodes} == {5.0}

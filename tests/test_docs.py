@@ -24,6 +24,7 @@ MADE = {  # by docs/hooks.py, from where it is in the repository
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("block", "runs"), BLOCKS)
 @pytest.mark.usefixtures("script_folder")
 def test_the_code_in_the_docs_runs(block, runs):

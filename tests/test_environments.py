@@ -20,6 +20,7 @@ def random_states(name, rng, count):
     return states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "registered"), PAIRS.items())
 def test_ten_thousand_transitions_agree_with_gymnasiums(name, registered, rng):
     env, theirs = getattr(environments, name)(), gym.make(registered).unwrapped
@@ -54,6 +55,7 @@ def test_spaces_and_limits_are_gymnasiums(name, registered):
     assert env.max_episode_steps == theirs.spec.max_episode_steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "registered"), PAIRS.items())
 def test_starts_are_spread_as_gymnasiums(name, registered):
     env, theirs = getattr(environments, name)(), gym.make(registered).unwrapped

@@ -49,6 +49,7 @@ OTHERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "parameters"),
     [(0, {}), (1, {}), (2, {"memory_size": 500}), (3, OTHERS)],
@@ -172,6 +173,7 @@ def test_weights_that_become_nan_stop_the_run_in_the_same_update(cartpole):
         next(loop)
 
 
+@pytest.mark.slow
 def test_resident_memory_stays_flat_over_150_000_steps(cartpole):
     config = Config(num_episodes=100_000, epsilon=0.1)
     agent = make_agent((4,), 2, config, 0)

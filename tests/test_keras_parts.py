@@ -14,6 +14,8 @@ from tests.helpers.parts import INFERENCE_ONLY, LOSSES, NETWORKS, OPTIMIZERS, ea
 GAMMA, TAU, NUM_STEPS = 0.9, 0.2, 5
 ALL_NETWORKS = NETWORKS | INFERENCE_ONLY
 
+pytestmark = pytest.mark.slow
+
 
 def two_of(make_network):
     """Two networks, made apart, of equal weights."""

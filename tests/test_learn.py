@@ -48,6 +48,7 @@ def test_loss_is_the_mean_over_the_batch():
     assert loss_values(batch, 0.5, linear_network(Q), linear_network(Q_HAT)).numpy() == (9 + 1) / 2
 
 
+@pytest.mark.slow
 def test_loss_values_is_the_same_in_a_tf_function(random_batch):
     q_network, q_hat_network, _ = agent()
     batch = random_batch()
@@ -93,6 +94,7 @@ def test_learn_agrees_with_a_float64_oracle_over_200_batches(jit_compile, random
     assert worst < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_actions", [1, 2, 3, 4, 5])
 def test_narrow_layers_learn_the_same_whether_compiled_or_not(num_actions):
     rng = np.random.default_rng(0)
@@ -169,6 +171,7 @@ def test_agents_do_not_touch_one_another(random_batch):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_one_trace_for_all_agents_alike_whatever_the_batch(random_batch, caplog):
     learn(random_batch(), 0.95, *agent())
     before = len(_shared)
@@ -201,6 +204,7 @@ def test_a_layer_frozen_between_two_calls_stays_as_it_is(random_batch):
     assert not np.array_equal(output, before[2])
 
 
+@pytest.mark.slow
 def test_fifty_dropped_agents_leave_no_memory_behind(random_batch):
     def use(seed):
         networks = agent(seed)
@@ -296,6 +300,7 @@ def test_networks_that_do_not_belong_together_are_refused(random_batch):
         learn(batch, 0.95, *make_networks(4, 2), optimizer)
 
 
+@pytest.mark.slow
 def test_without_private_api_the_numbers_are_the_same(random_batch, monkeypatch):
     programs = importlib.import_module("dqn_keras._engine.programs")
 

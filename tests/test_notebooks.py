@@ -54,6 +54,7 @@ def test_the_rendered_notebook_does_not_depend_on_the_python_that_rendered_it():
     assert rendered(NOTEBOOKS / "deep_q_network.py").metadata["language_info"] == {"name": "python"}
 
 
+@pytest.mark.slow
 def test_a_cell_that_is_run_twice_does_no_harm(capsys, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.chdir(NOTEBOOKS)

@@ -72,6 +72,7 @@ def weights(run):
 # Environments
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make_env",
     [
@@ -90,6 +91,7 @@ def test_gymnasiums_environments_train(make_env):
     assert np.isfinite(evaluate(env, run.q_network, 2, seed=0, max_steps=40)).all()
 
 
+@pytest.mark.slow
 def test_frozen_lake_is_solved():
     # No chance in its moves: the way over the ice gives 1, every time; over three seeds, so that it is no luck.
     config = Config(num_episodes=600, gamma=0.9, epsilon_min=0.01, decay=0.99, solved_reward=0.9, tau=0.05)
@@ -112,6 +114,7 @@ def test_a_time_limit_of_the_readers_own_truncates():
 # Networks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make_env", [lambda: gym.make("CartPole-v1"), CartPole], ids=["Gymnasium", "compiled"])
 def test_a_network_of_the_readers_own_is_trained_in_place(make_env):
     network = tanh_network()
@@ -157,6 +160,7 @@ def test_a_network_that_numpy_cannot_compute_learns_the_same_as_one_that_it_can(
     np.testing.assert_allclose(weights(first), weights(second), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_convolutional_network_learns_from_images():
     config = Config(num_episodes=200, steps_per_update=1, decay=0.97, gamma=0.0, alpha=0.003, solved_reward=8.5)
     for seed in range(2):  # chance gives 3.3 of 10, and exploring at 0.1 costs 0.7
@@ -188,6 +192,7 @@ class FunctionalBeacon(FuncEnv):
         return tf.constant(False)
 
 
+@pytest.mark.slow
 def test_images_of_a_functional_environment_are_learned_from_in_compiled_episodes():
     config = Config(num_episodes=200, steps_per_update=1, decay=0.97, gamma=0.0, alpha=0.003, solved_reward=8.5)
     run = train(FunctionalBeacon(), config, seed=0, q_network=convolutional(), verbose=0)
@@ -200,6 +205,7 @@ def test_images_of_a_functional_environment_are_learned_from_in_compiled_episode
     np.testing.assert_array_equal(batch.state[1:10], batch.next_state[:9])
 
 
+@pytest.mark.slow
 def test_a_run_with_a_network_of_the_readers_own_is_saved_and_gone_on_from(tmp_path):
     whole = train(Beacon(), QUICK, seed=0, q_network=convolutional(), verbose=0)
     part = Config(**{**vars(QUICK), "num_episodes": 3})
@@ -225,6 +231,7 @@ def dueling():
     return keras.Model(inputs, value + advantage - keras.ops.mean(advantage, axis=-1, keepdims=True))
 
 
+@pytest.mark.slow
 def test_equal_networks_are_the_same_to_a_checkpoint_whatever_they_are_called(cartpole, tmp_path):
     first, second = dueling(), dueling()
     whole = train(cartpole, QUICK, seed=0, q_network=first, verbose=0)
@@ -233,6 +240,7 @@ def test_equal_networks_are_the_same_to_a_checkpoint_whatever_they_are_called(ca
     train(cartpole, QUICK, seed=0, q_network=dueling(), checkpoint=tmp_path, resume=True, verbose=0)
 
 
+@pytest.mark.slow
 def test_networks_that_differ_are_told_apart_whatever_they_are_called(cartpole, tmp_path):
     def named(activation):
         hidden = keras.layers.Dense(8, activation, name=activation)
@@ -243,6 +251,7 @@ def test_networks_that_differ_are_told_apart_whatever_they_are_called(cartpole, 
         train(cartpole, QUICK, seed=0, q_network=named("sigmoid"), checkpoint=tmp_path, resume=True, verbose=0)
 
 
+@pytest.mark.slow
 def test_a_layer_that_is_defined_anew_is_run_anew(cartpole):
     def train_with(function):
         class Bend(keras.layers.Layer):

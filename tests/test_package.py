@@ -20,6 +20,7 @@ def test_learn_is_one_function_under_both_spellings():
     assert (loss_values, update_q_hat) == (dqn_keras.loss_values, dqn_keras.update_q_hat)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("statement", ["from dqn_keras import train", "from dqn_keras.environments import CartPole"])
 def test_importing_prints_nothing(statement):
     environment = {k: v for k, v in os.environ.items() if k != "TF_CPP_MIN_LOG_LEVEL"}
@@ -32,6 +33,7 @@ def test_importing_prints_nothing(statement):
     assert (done.stdout, done.stderr) == (b"", b"")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "first",
     ["import dqn_keras.learn", "import dqn_keras.study", "from dqn_keras import train", "import dqn_keras.training"],

@@ -108,6 +108,7 @@ SAME_OR_NOT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slot", SAME_OR_NOT)
 def test_a_run_is_resumed_with_the_same_parts_and_with_no_others(slot, tmp_path, cartpole):
     def go_on(part, folder, resume=True):
@@ -253,6 +254,7 @@ NESTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", NESTED)
 def test_parts_are_known_by_all_that_they_hold(part, tmp_path):
     make = NESTED[part]
@@ -271,6 +273,7 @@ CHANGED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", CHANGED)
 def test_functions_are_known_by_all_that_they_read(changed, tmp_path, monkeypatch):
     loss, name, value = CHANGED[changed]
@@ -332,6 +335,7 @@ def used_network():
     return network
 
 
+@pytest.mark.slow
 def test_an_optimizer_that_was_built_or_used_is_the_same_run(tmp_path):
     def built():
         network, optimizer = NETWORKS["dense"](), keras.optimizers.AdamW(0.01)
@@ -372,6 +376,7 @@ class Counting(keras.layers.Layer):
         return inputs * (1 + 0.001 * self.num_calls)
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 def test_variables_of_the_users_are_part_of_a_checkpoint(make_env, tmp_path):
     def run(num_episodes, **more):
@@ -385,6 +390,7 @@ def test_variables_of_the_users_are_part_of_a_checkpoint(make_env, tmp_path):
     np.testing.assert_array_equal(whole, run(12, checkpoint=tmp_path, resume=True))
 
 
+@pytest.mark.slow
 @BOTH_LOOPS
 def test_a_run_with_own_parts_is_resumed_bit_for_bit(make_env, tmp_path):
     def run(num_episodes, **more):

@@ -34,6 +34,7 @@ def same(first, second):
     np.testing.assert_array_equal(first.solved_at, second.solved_at)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", [CartPole(), gym.make("CartPole-v1")], ids=["functional", "Gymnasium"])
 def test_a_seed_is_the_run_of_train_whichever_others_run_with_it_in_whatever_process(env):
     outcomes = study(env, QUICK, [5, 3, 4, 0], num_workers=2, verbose=0)
@@ -49,6 +50,7 @@ def test_a_seed_is_the_run_of_train_whichever_others_run_with_it_in_whatever_pro
     assert outcomes.num_env_steps == outcomes.rewards.sum()  # CartPole's reward is 1 a step
 
 
+@pytest.mark.slow
 def test_an_environment_that_is_not_registered_goes_to_the_workers_as_it_is():
     config = Config(num_episodes=60, batch_size=8, solved_reward=3.5)
     outcomes = study(Corridor(length=100, limit=4), config, range(3), num_workers=2, verbose=0)
@@ -56,6 +58,7 @@ def test_an_environment_that_is_not_registered_goes_to_the_workers_as_it_is():
     assert outcomes.rewards.shape == (3, 50)
 
 
+@pytest.mark.slow
 def test_workers_see_what_was_changed_in_a_module_since_its_import(tmp_path, monkeypatch):
     (tmp_path / "payment.py").write_text("AMOUNT = 1.0\n")
     (tmp_path / "paying.py").write_text(
@@ -75,6 +78,7 @@ def test_workers_see_what_was_changed_in_a_module_since_its_import(tmp_path, mon
         sys.modules.pop(name)
 
 
+@pytest.mark.slow
 def test_a_change_that_workers_cannot_see_is_refused(monkeypatch):
     monkeypatch.setattr(importlib.import_module("dqn_keras.environments.cartpole"), "GRAVITY", 30.0)
     with pytest.raises(ValueError, match=r"^num_workers must be 1 for env CartPole, which computes something else"):
@@ -146,6 +150,7 @@ print("kept", len(outcome.seeds), flush=True)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [1, 14])  # while the workers start; when seeds are finished
 def test_ctrl_c_in_a_terminal_keeps_the_finished_seeds(seconds, tmp_path):
     file = tmp_path / "study.npz"
@@ -162,6 +167,7 @@ def test_ctrl_c_in_a_terminal_keeps_the_finished_seeds(seconds, tmp_path):
     assert int(number) == len(load_study(file).seeds)
 
 
+@pytest.mark.slow
 def test_an_environment_is_copied_as_it_is():
     env = gym.make("CartPole-v1")
     env.unwrapped.gravity = 500.0
@@ -169,6 +175,7 @@ def test_an_environment_is_copied_as_it_is():
     np.testing.assert_array_equal(outcomes.rewards[0], train(env, QUICK, 0, verbose=0).rewards)
 
 
+@pytest.mark.slow
 def test_an_environment_that_has_rendered_is_made_anew_from_its_spec():
     env = gym.make("CartPole-v1", render_mode="rgb_array")
     env.reset(seed=0)
@@ -237,6 +244,7 @@ def kill_a_busy_worker(killed):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_a_cluster_of_two_nodes_loses_a_worker_and_the_numbers_are_the_same(monkeypatch):
     import ray
     from ray.cluster_utils import Cluster

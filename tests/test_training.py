@@ -10,6 +10,7 @@ from tests.helpers.environments import Corridor
 from tests.helpers.runs import QUICK, Tape, fingerprint
 
 
+@pytest.mark.slow
 def test_cartpole_is_solved_in_the_originals_way(cartpole, capsys):
     # One seed is enough to see every line printed; how often it succeeds is measured over many (results/).
     run = train(cartpole, Config(), seed=0)
@@ -36,6 +37,7 @@ def test_the_stop_rule_wants_more_not_as_much():
     assert train(Corridor(length=100, limit=4), config, seed=0, verbose=0).solved_at is None
 
 
+@pytest.mark.slow
 def test_one_seed_gives_the_same_bits_in_another_process_and_another_seed_does_not(cartpole, in_another_process):
     here = fingerprint(train(cartpole, QUICK, seed=5, verbose=0))
     assert in_another_process("gym.make('CartPole-v1')", seed=5) == here
@@ -108,6 +110,7 @@ def test_an_error_at_the_end_of_training_is_not_swallowed():
         train(Corridor(length=100, limit=4), config, seed=0, verbose=0, callbacks=[Full()])
 
 
+@pytest.mark.slow
 def test_the_networks_have_the_hidden_layers_of_the_config():
     run = train(Corridor(length=2), Config(num_episodes=9, batch_size=8, hidden_units=(5, 3)), seed=0, verbose=0)
     assert [layer.units for layer in run.q_network.layers] == [5, 3, 2]
@@ -142,6 +145,7 @@ def test_numpy_seeds_are_taken(cartpole):
     assert train(cartpole, Config(num_episodes=4, batch_size=8), seed=np.int64(3), verbose=0).seed == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["Acrobot-v1", "MountainCar-v0"])
 def test_other_environments_train(name):
     run = train(gym.make(name), Config(num_episodes=2), seed=0, verbose=0)

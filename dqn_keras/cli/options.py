@@ -130,7 +130,14 @@ class Plot:
     """Folder of the run or the study; the picture is written there, as curve.png or study.png."""
 
 
-_COMMANDS: Any = Train | Resume | Watch | Evaluate | Study | Plot
+def parse(arguments: Sequence[str]) -> Any:
+    """Returns the command with its options, checked. After the help or an error, tyro raises SystemExit."""
+    commands: Any = Train | Resume | Watch | Evaluate | Study | Plot
+    description = "Train Deep Q-Networks on Gymnasium's environments."
+    command = tyro.cli(commands, prog="dqn-keras", description=description, args=arguments)
+    if isinstance(command, _Task):
+        command.config = cast(Any, Config(**vars(command.config)))
+    return command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -148,14 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.path.append(os.getcwd())  # MODULE:ID looks here too, however this was started
     command = None
     try:
-        command = tyro.cli(
-            _COMMANDS,
-            prog="dqn-keras",
-            description="Train Deep Q-Networks on Gymnasium's environments.",
-            args=arguments,
-        )
-        if isinstance(command, _Task):
-            command.config = cast(Any, Config(**vars(command.config)))
+        command = parse(arguments)
         from dqn_keras.cli import commands
 
         warnings.formatwarning = lambda message, *_: f"dqn-keras: {_in_plain_text(str(message))}\n"
