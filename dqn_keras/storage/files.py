@@ -24,7 +24,7 @@ class DamagedError(ValueError):
 def to_bytes(arrays: Mapping[str, Any], facts: dict[str, Any]) -> bytes:
     """Returns the content of a checkpoint file."""
     file = io.BytesIO()
-    np.savez(file, allow_pickle=False, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
+    np.savez(file, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
     body = file.getvalue()
     return body + hashlib.sha256(body).digest()
 
