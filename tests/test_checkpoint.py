@@ -139,6 +139,13 @@ def test_the_folder_keeps_the_last_two_and_nothing_else(tmp_path):
     assert sorted(path.name for path in folder.iterdir()) == ["checkpoint-0000000035.npz", "checkpoint-0000000040.npz"]
 
 
+def test_a_finished_run_that_is_resumed_keeps_both_checkpoints(tmp_path):
+    for _ in range(2):
+        play("Gymnasium loop", tmp_path, QUICK, callbacks=[keras.callbacks.Callback()])
+        names = sorted(path.name for path in tmp_path.iterdir())
+        assert names == ["checkpoint-0000000035.npz", "checkpoint-0000000040.npz"]
+
+
 def test_a_damaged_checkpoint_is_not_one_of_the_two_that_are_kept(tmp_path):
     play("Gymnasium loop", tmp_path, QUICK)
     newest(tmp_path).write_bytes(b"")

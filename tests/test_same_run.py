@@ -132,7 +132,9 @@ def test_another_source_under_the_same_name_is_noticed(tmp_path, cartpole, monke
 
     scaled_again.__qualname__ = "scaled_loss"
     monkeypatch.setattr(module, "scaled_loss", scaled_again)
-    message = r"^loss is 'tests.test_same_run.scaled_loss' in .*npz, got one of that name that computes another thing$"
+    message = (
+        r"^loss is 'tests.test_same_run.scaled_loss' in .*npz, got one of that name that computes something else: "
+    )
     with pytest.raises(ValueError, match=message):
         go_on(tmp_path, loss=scaled_again)
 
@@ -280,14 +282,16 @@ def test_functions_are_known_by_all_that_they_read(changed, tmp_path, monkeypatc
     go_on(tmp_path, resume=False, loss=loss)
     go_on(tmp_path, loss=loss)
     monkeypatch.setattr(importlib.import_module(__name__), name, value)
-    with pytest.raises(ValueError, match=rf"^loss is 'tests.test_same_run.{loss.__name__}' .* computes another thing$"):
+    with pytest.raises(
+        ValueError, match=rf"^loss is 'tests.test_same_run.{loss.__name__}' .* computes something else: "
+    ):
         go_on(tmp_path, loss=loss)
 
 
 def test_another_gravity_of_the_packages_cartpole_is_another_run(tmp_path, monkeypatch):
     go_on(tmp_path, resume=False, env=CartPole())
     monkeypatch.setattr(cartpole_module, "GRAVITY", np.float32(20.0))
-    with pytest.raises(ValueError, match=r"^env is .* computes another thing$"):
+    with pytest.raises(ValueError, match=r"^env is .* computes something else: "):
         go_on(tmp_path, env=CartPole())
 
 
@@ -311,7 +315,7 @@ def test_a_wrapped_name_of_the_packages_does_not_hide_a_function(tmp_path, monke
     monkeypatch.setattr(module, "own_targets", wrapped)
     go_on(tmp_path, resume=False, targets=wrapped)
     monkeypatch.setattr(module, "FACTOR", 2.0)
-    with pytest.raises(ValueError, match=r"^targets is .* computes another thing$"):
+    with pytest.raises(ValueError, match=r"^targets is .* computes something else: "):
         go_on(tmp_path, targets=wrapped)
 
 

@@ -35,7 +35,7 @@ class Checkpoints:
         self.folder = Path(folder)
         self._every, self._saved_at = every, 0
         self._identity, self._other_variables = identity
-        self._kept: list[Path] = []  # newest first, all known to be whole
+        self._kept: list[Path] = []  # newest first; the first is whole
 
     def paths(self) -> list[Path]:
         """Returns the checkpoint files, newest first."""
@@ -113,7 +113,7 @@ class Checkpoints:
             if damaged:
                 warnings.warn(f"{'; '.join(damaged)}. The run continues from the older {path}", stacklevel=4)
             warn_of_other_versions(path, facts, self._identity, stacklevel=5)
-            self._kept = [path]
+            self._kept = [other for other in self.paths() if other <= path][:2]  # the newer ones are damaged
             return path
         if damaged:
             raise ValueError(f"checkpoint: {'; '.join(damaged)}")

@@ -138,7 +138,8 @@ def check_is_same(path: Path, theirs: dict[str, Any], ours: dict[str, Any], may_
         if can_compare and saved.computes and here.computes:
             if saved.computes != here.computes:
                 raise ValueError(
-                    f"{name} is {saved.words!r} in {path}, got one of that name that computes another thing"
+                    f"{name} is {saved.words!r} in {path}, got one of that name that computes something else: "
+                    "its code, or something that it reads, has changed"
                 )
         elif saved.source != here.source:
             raise ValueError(f"{name} is {saved.words!r} in {path}, got one of that name with another source")
