@@ -23,6 +23,7 @@ import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 from joblib import Parallel, cpu_count, delayed, parallel_config
 
+from dqn_keras._engine.cache import publish
 from dqn_keras._engine.libraries import is_of_a_library
 from dqn_keras._engine.programs import shared_in
 from dqn_keras._engine.recycling import recycle
@@ -233,17 +234,32 @@ def _train_seed_in_worker(env_copy: _PickledEnv, config: Config, seed: int) -> O
     """Trains one seed in a worker process. TensorFlow gets one thread there, because each core has a process."""
     with contextlib.suppress(RuntimeError):  # TensorFlow has started already, in a worker with an earlier task
         tf.config.threading.set_intra_op_parallelism_threads(1)
-    return _train_seed(env_copy, config, seed)
+    outcome = _train_seed(env_copy, config, seed)
+    publish()  # now, since a worker may be killed when the study ends
+    return outcome
 
 
 def _by_joblib(env_copy: _PickledEnv, config: Config, seeds: list[int], num_workers: int) -> _Results:
     if num_workers == 1 or len(seeds) <= 1:
         yield from (_train_seed(env_copy, config, seed) for seed in seeds)
         return
-    with parallel_config(backend="loky", inner_max_num_threads=1), _interrupts_ignored_by_children():
+    backend = parallel_config(backend="loky", inner_max_num_threads=1)
+    with backend, _compilation_cache_in_children(), _interrupts_ignored_by_children():
         parallel = Parallel(n_jobs=min(num_workers, len(seeds)), batch_size=1, return_as="generator_unordered")
         results = parallel(delayed(_train_seed_in_worker)(env_copy, config, seed) for seed in seeds)
     yield from results
+
+
+@contextlib.contextmanager
+def _compilation_cache_in_children() -> Iterator[None]:
+    """Lets the processes that start within the block use the cache of compiled programs, unless the user chose."""
+    is_chosen = "DQN_KERAS_CACHE" in os.environ
+    os.environ.setdefault("DQN_KERAS_CACHE", "1")
+    try:
+        yield
+    finally:
+        if not is_chosen:
+            del os.environ["DQN_KERAS_CACHE"]
 
 
 @contextlib.contextmanager

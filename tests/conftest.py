@@ -7,6 +7,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+os.environ.setdefault("DQN_KERAS_CACHE", "0")  # tests leave nothing in the user's folders
+
 
 @pytest.fixture
 def cartpole():

@@ -5,8 +5,12 @@ All other modules import `keras` and `tf` from here, so that the order in which 
 
 import contextlib
 import functools
+import gc
 import os
+import sys
 from collections.abc import Iterator
+
+from dqn_keras._engine.cache import use_cache
 
 
 @contextlib.contextmanager
@@ -27,6 +31,35 @@ def _native_stderr_silenced() -> Iterator[None]:
         os.close(nowhere)
 
 
+@contextlib.contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """Stops Python's garbage collector for the block: TensorFlow's import makes many objects and hardly any garbage."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+def _set_up_xla() -> None:
+    """Sets how XLA compiles in this process, unless the user has.
+
+    XLA compiles a small loop into one function. Its option, an undocumented one, raises the limit for that from 1 to
+    100 kB, so that compiled episodes are about 1.15 times as fast, with the same bits.
+
+    DQN_KERAS_CACHE is 1 for a cache of compiled programs in the user's cache folder, 0 for none, or a folder for it.
+    Notebooks and the command line have one by default.
+    """
+    if "xla_backend_extra_options" not in (flags := os.environ.get("XLA_FLAGS", "")):
+        option = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000"
+        os.environ["XLA_FLAGS"] = f"{flags} {option}".strip()
+    cache = os.environ.get("DQN_KERAS_CACHE", "1" if "ipykernel" in sys.modules else "0")
+    if cache != "0":
+        use_cache(None if cache == "1" else cache)
+
+
 def require_tensorflow_backend(name: str) -> None:
     """Raises ImportError, with the remedy, if the backend `name` is not TensorFlow."""
     if name != "tensorflow":
@@ -36,11 +69,13 @@ def require_tensorflow_backend(name: str) -> None:
         )
 
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # errors still show
 # If pygame opens a window with OpenGL, a process with TensorFlow crashes: each of the two loads its own LLVM.
 os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
 require_tensorflow_backend(os.environ.get("KERAS_BACKEND", "tensorflow"))
-with _native_stderr_silenced():
+if "tensorflow" not in sys.modules:
+    _set_up_xla()
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # errors still show
+with _native_stderr_silenced(), _no_garbage_collection():
     import keras
     import tensorflow as tf
 

@@ -150,6 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"dqn_keras {__version__}")
         return 0
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    os.environ.setdefault("DQN_KERAS_CACHE", "1")
     os.environ.setdefault("MPLBACKEND", "Agg")
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     sys.path.append(os.getcwd())  # MODULE:ID looks here too, however this was started

@@ -1,7 +1,6 @@
 """The software versions and the processor that a result was made with."""
 
 import platform
-import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from dqn_keras._engine.machine import processor
 from dqn_keras._engine.tensorflow import keras, tf
 from dqn_keras.version import __version__
 
@@ -17,17 +17,7 @@ def versions() -> dict[str, str]:
     """Returns the versions and the processor, on which the last bits of a result may depend."""
     modules = {"tensorflow": tf, "keras": keras, "numpy": np, "gymnasium": gym}
     versions = {name: module.__version__ for name, module in modules.items()}
-    return {"dqn_keras": __version__, "python": platform.python_version(), **versions, "processor": _processor()}
-
-
-def _processor() -> str:
-    """Returns the kind of processor, with its vector instructions if the system lists them."""
-    try:
-        flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        flags = None
-    vector = sorted(x for x in flags[1].split() if x.startswith(("sse4", "avx", "fma", "amx"))) if flags else []
-    return " ".join([platform.machine(), *vector])
+    return {"dqn_keras": __version__, "python": platform.python_version(), **versions, "processor": processor()}
 
 
 def warn_of_other_versions(path: Path, theirs: dict[str, Any], ours: dict[str, Any], stacklevel: int) -> None:

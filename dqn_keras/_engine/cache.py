@@ -1,0 +1,86 @@
+"""A cache on disk of what XLA has compiled, so that another process need not compile it again.
+
+TensorFlow can keep such a cache, but it trusts every file in the folder and writes files in place. So each process gets
+a folder of its own, which starts with links to the checked files of the shared folder. `publish` moves new files there.
+The name of a shared file ends with the SHA-256 of its content.
+
+This module does not import TensorFlow, because TensorFlow reads the setting at its import.
+"""
+
+import atexit
+import contextlib
+import hashlib
+import importlib.metadata
+import os
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+import platformdirs
+
+from dqn_keras._engine.machine import processor
+
+_OPTION = "--tf_xla_persistent_cache_directory="
+_MOST_FILES = 100  # of about 1.5 MB each
+_A_DAY = 24 * 60 * 60  # the folder of a killed process stays that long
+
+
+_own: Path | None = None
+"""This process's folder, if it uses the cache."""
+
+
+def use_cache(folder: str | os.PathLike | None = None) -> None:
+    """Lets TensorFlow, not imported yet, keep compiled programs in `folder` (default: the user's cache folder).
+
+    Does nothing if TF_XLA_FLAGS already names a cache, or if the folder cannot be used.
+    """
+    global _own
+    flags = os.environ.get("TF_XLA_FLAGS", "")
+    shared = Path(folder or platformdirs.user_cache_dir("dqn_keras")) / _kind_of_code()
+    if _OPTION in flags or any(map(str.isspace, str(shared))):  # TensorFlow splits its flags at spaces
+        return
+    try:
+        shared.mkdir(parents=True, exist_ok=True)
+        for path in shared.glob("process-*"):
+            if path.stat().st_mtime < time.time() - _A_DAY:
+                shutil.rmtree(path, ignore_errors=True)
+        _own = Path(tempfile.mkdtemp(prefix="process-", dir=shared))
+        for path in shared.glob("*.pb.*"):
+            if path.suffix[1:] == _digest(path) and not (_own / path.stem).exists():
+                os.link(path, _own / path.stem)
+            else:  # it is damaged, or two processes have stored the same program
+                path.unlink()
+    except OSError:
+        return
+    os.environ["TF_XLA_FLAGS"] = f"{flags} {_OPTION}{_own}".strip()
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "2") == "2":  # the package's own default, or inherited from a parent
+        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # TensorFlow logs an error for each file that it reads without one
+    atexit.register(_leave, _own)
+
+
+def publish() -> None:
+    """Gives the programs that this process has compiled to later processes; of many, the oldest are deleted."""
+    if _own is None:
+        return
+    with contextlib.suppress(OSError):  # a full disk, or another process has deleted the file
+        for path in _own.glob("*.pb"):
+            if not list(_own.parent.glob(f"{path.name}.*")):
+                os.replace(path, _own.parent / f"{path.name}.{_digest(path)}")
+        oldest_first = sorted(_own.parent.glob("*.pb.*"), key=lambda path: path.stat().st_mtime)
+        for path in oldest_first[:-_MOST_FILES]:
+            path.unlink()
+
+
+def _leave(own: Path) -> None:
+    publish()
+    shutil.rmtree(own, ignore_errors=True)
+
+
+def _kind_of_code() -> str:
+    kind = f"{importlib.metadata.version('tensorflow')} {processor()}"
+    return f"xla-{hashlib.sha256(kind.encode()).hexdigest()[:16]}"
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

@@ -1,0 +1,104 @@
+"""The start of a process: the cache of compiled programs, the option of XLA, the garbage collector."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+SCRIPT = """
+import gymnasium as gym
+from dqn_keras import train
+from tests.helpers.runs import QUICK, fingerprint
+print(fingerprint(train(gym.make("CartPole-v1"), QUICK, seed=0, verbose=0)))
+"""
+
+
+def start(script=SCRIPT, **environment):
+    return subprocess.Popen(
+        [sys.executable, "-c", script],
+        env={k: x for k, x in os.environ.items() if k not in ("XLA_FLAGS", "TF_XLA_FLAGS")} | environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def output(process):
+    out, err = process.communicate()
+    assert (process.returncode, err) == (0, "")
+    return out
+
+
+def kept(folder):
+    """The contents of the cache, by name."""
+    assert not list(folder.glob("*/process-*"))
+    return {path.name: path.read_bytes() for path in folder.glob("*/*")}
+
+
+@pytest.mark.slow
+def test_a_cache_is_filled_and_used_and_changes_no_bit(tmp_path):
+    plain = output(start(DQN_KERAS_CACHE="0"))
+    assert output(start(DQN_KERAS_CACHE=str(tmp_path))) == plain
+    first = kept(tmp_path)
+    assert first
+    assert output(start(DQN_KERAS_CACHE=str(tmp_path))) == plain
+    assert kept(tmp_path) == first  # a program that is compiled again is stored again, with other bytes
+
+
+@pytest.mark.slow
+def test_a_file_of_the_cache_that_is_not_whole_is_made_again(tmp_path):
+    plain = output(start(DQN_KERAS_CACHE=str(tmp_path)))
+    first = kept(tmp_path)
+    for path in tmp_path.glob("*/*"):
+        path.write_bytes(path.read_bytes()[:-100])
+    assert output(start(DQN_KERAS_CACHE=str(tmp_path))) == plain
+    assert len(kept(tmp_path)) == len(first)
+    assert output(start(DQN_KERAS_CACHE=str(tmp_path))) == plain
+
+
+@pytest.mark.slow
+def test_processes_that_fill_the_cache_at_once_do_each_other_no_harm(tmp_path):
+    assert len({output(process) for process in [start(DQN_KERAS_CACHE=str(tmp_path)) for _ in range(3)]}) == 1
+    output(start(DQN_KERAS_CACHE=str(tmp_path)))
+    before = kept(tmp_path)
+    output(start(DQN_KERAS_CACHE=str(tmp_path)))
+    assert kept(tmp_path) == before
+    assert len({name.rpartition(".")[0] for name in before}) == len(before)
+
+
+FLAGS = """
+import gc, os
+gc.disable() if {is_off} else None
+{first}
+import dqn_keras.learn
+print(gc.isenabled(), os.environ.get("XLA_FLAGS"), os.environ.get("TF_XLA_FLAGS"))
+"""
+IN_SILENCE = "import os; os.dup2(os.open(os.devnull, os.O_WRONLY), 2); import tensorflow"
+OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000"
+
+
+def flags(first="", is_off=False, **environment):
+    return output(start(FLAGS.format(first=first, is_off=is_off), **{"DQN_KERAS_CACHE": "0", **environment})).strip()
+
+
+def test_the_garbage_collector_is_as_it_was():
+    assert flags().startswith("True")
+    assert flags(is_off=True).startswith("False")
+
+
+def test_what_the_user_chose_stays():
+    assert flags() == f"True {OPTION} None"
+    assert flags(XLA_FLAGS="--xla_cpu_enable_fast_math=false") == f"True --xla_cpu_enable_fast_math=false {OPTION} None"
+    chosen = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1024"
+    assert flags(XLA_FLAGS=chosen) == f"True {chosen} None"
+    assert flags(first=IN_SILENCE) == "True None None"
+    chosen = "--tf_xla_persistent_cache_directory=/nowhere"
+    assert flags(TF_XLA_FLAGS=chosen, DQN_KERAS_CACHE="1") == f"True {OPTION} {chosen}"
+
+
+def test_a_folder_that_cannot_be_used_is_no_error(tmp_path):
+    (tmp_path / "a file").touch()
+    (tmp_path / "file").touch()
+    assert flags(DQN_KERAS_CACHE=str(tmp_path / "a file")) == flags(DQN_KERAS_CACHE=str(tmp_path / "file"))
+    assert flags(DQN_KERAS_CACHE=str(tmp_path / "file")).endswith("None")
