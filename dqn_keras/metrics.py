@@ -46,7 +46,7 @@ LOGGED = {
     "terminal_share": "Share of terminal transitions in the memory.",
     "steps_per_second": "Environment steps per second, learning included; NaN for episodes from before a resume.",
 }
-"""The values that are logged for each episode: callbacks get them, and `run.history` holds them."""
+"""The values that are logged for each episode, for callbacks, `run.history` and log.csv; `Log.add` computes them."""
 
 
 class Log:

@@ -18,6 +18,8 @@ class Experience(NamedTuple):
 
     `terminal_state` is 1 if the environment *terminated*: no state follows, so there is no bootstrapping. A time limit
     (`truncated`) also ends an episode, but its last state has a future, so `terminal_state` is 0.
+
+    Transitions are made in two places: `loops/gymnasium.py`, `_play_episode`, and `loops/compiled.py`, `_Loop._step`.
     """
 
     state: Any  # [*S] float32, or uint8 for images

@@ -265,6 +265,7 @@ def _timed(episodes: Iterator[Episode], run: Run) -> Generator[Episode, None, No
 def _is_solved(episodes: Sequence[Episode], config: Config) -> bool:
     """Returns whether the stop rule holds after the last episode.
 
+    Compiled episodes stop early where it may hold (`_Loop.play`), so that a change of the rule belongs there, too.
     The original also takes the mean of fewer episodes than the window, so that one lucky first episode could stop it.
     """
     last = [episode.reward for episode in episodes[-config.solved_window :]]

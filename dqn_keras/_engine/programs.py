@@ -1,4 +1,4 @@
-"""Compiled programs. The package's own networks share them; the user's objects are traced as they are.
+"""Compiled programs, and which agents can share one: those with the package's own networks and a plain Adam.
 
 TensorFlow traces a function for particular variables, and what XLA compiles from the trace is never freed: a second
 agent would cost seconds of compilation and megabytes of memory. Therefore a program for networks that the package made

@@ -1,4 +1,4 @@
-"""Checks of an environment's spaces, and of all that a gymnasium.Env returns; compiled episodes check their own."""
+"""Checks of an environment's spaces, and of what a gymnasium.Env returns (compiled: `loops/compiled.py`, `_step`)."""
 
 import math
 from collections.abc import Callable

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import itertools
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -196,7 +197,7 @@ def read_log(folder: Path) -> dict[str, list[float]]:
         with (folder / "log.csv").open(newline="") as file:
             for row in csv.DictReader(file):
                 with contextlib.suppress(KeyError, TypeError, ValueError):  # the last row may be incomplete
-                    rows[int(row["epoch"])] = {name: float(row[name]) for name in LOGGED}
+                    rows[int(row["epoch"])] = {name: float(row.get(name, math.nan)) for name in LOGGED}
     return {name: [rows[episode][name] for episode in sorted(rows)] for name in LOGGED}
 
 
