@@ -97,6 +97,16 @@ def test_what_the_user_chose_stays():
     assert flags(TF_XLA_FLAGS=chosen, DQN_KERAS_CACHE="1") == f"True {OPTION} {chosen}"
 
 
+def test_a_process_does_not_use_the_folder_of_its_parent(tmp_path):
+    parents = f"--tf_xla_persistent_cache_directory={tmp_path}/xla-0/process-abc"
+    assert flags(TF_XLA_FLAGS=f"--tf_xla_auto_jit=0 {parents}") == f"True {OPTION} --tf_xla_auto_jit=0"
+    assert flags(TF_XLA_FLAGS=parents) == f"True {OPTION} None"
+    own = flags(TF_XLA_FLAGS=parents, DQN_KERAS_CACHE=str(tmp_path))
+    assert str(tmp_path) in own
+    assert "process-abc" not in own
+    assert not list(tmp_path.glob("*/process-*"))
+
+
 def test_a_folder_that_cannot_be_used_is_no_error(tmp_path):
     (tmp_path / "a file").touch()
     (tmp_path / "file").touch()

@@ -1,8 +1,8 @@
 """A cache on disk of what XLA has compiled, so that another process need not compile it again.
 
 TensorFlow can keep such a cache, but it trusts every file in the folder and writes files in place. So each process gets
-a folder of its own, which starts with links to the checked files of the shared folder. `publish` moves new files there.
-The name of a shared file ends with the SHA-256 of its content.
+a folder of its own, with copies of the shared folder's files, checked by the SHA-256 at the end of their names. `publish`
+moves new files to the shared folder.
 
 This module does not import TensorFlow, because TensorFlow reads the setting at its import.
 """
@@ -12,6 +12,7 @@ import contextlib
 import hashlib
 import importlib.metadata
 import os
+import re
 import shutil
 import tempfile
 import time
@@ -30,33 +31,39 @@ _own: Path | None = None
 """This process's folder, if it uses the cache."""
 
 
-def use_cache(folder: str | os.PathLike | None = None) -> None:
-    """Lets TensorFlow, not imported yet, keep compiled programs in `folder` (default: the user's cache folder).
+def use_cache(choice: str) -> None:
+    """Lets TensorFlow, not imported yet, keep compiled programs on disk.
 
-    Does nothing if TF_XLA_FLAGS already names a cache, or if the folder cannot be used.
+    Does nothing if TF_XLA_FLAGS names a cache of the user's, or if the folder cannot be used.
+
+    Args:
+        choice: "1" for the user's cache folder, "0" for no cache, or a folder.
     """
     global _own
-    flags = os.environ.get("TF_XLA_FLAGS", "")
-    shared = Path(folder or platformdirs.user_cache_dir("dqn_keras")) / _kind_of_code()
-    if _OPTION in flags or any(map(str.isspace, str(shared))):  # TensorFlow splits its flags at spaces
+    flags = re.sub(rf"{_OPTION}\S*/process-\S*", "", os.environ.pop("TF_XLA_FLAGS", "")).strip()  # a parent's folder
+    if flags:
+        os.environ["TF_XLA_FLAGS"] = flags
+    shared = Path(platformdirs.user_cache_dir("dqn_keras") if choice == "1" else choice) / _kind_of_code()
+    if choice == "0" or _OPTION in flags or any(map(str.isspace, str(shared))):  # TensorFlow splits flags at spaces
         return
     try:
         shared.mkdir(parents=True, exist_ok=True)
-        for path in shared.glob("process-*"):
-            if path.stat().st_mtime < time.time() - _A_DAY:
-                shutil.rmtree(path, ignore_errors=True)
         _own = Path(tempfile.mkdtemp(prefix="process-", dir=shared))
-        for path in shared.glob("*.pb.*"):
-            if path.suffix[1:] == _digest(path) and not (_own / path.stem).exists():
-                os.link(path, _own / path.stem)
-            else:  # it is damaged, or two processes have stored the same program
-                path.unlink()
     except OSError:
         return
+    for path in shared.iterdir():
+        with contextlib.suppress(OSError):  # another process has deleted it
+            if path.is_dir():
+                if path.stat().st_mtime < time.time() - _A_DAY:
+                    shutil.rmtree(path)
+            elif path.suffix[1:] == _digest(path) and not (_own / path.stem).exists():
+                shutil.copyfile(path, _own / path.stem)
+            else:  # it is damaged, or two processes have stored the same program
+                path.unlink()
     os.environ["TF_XLA_FLAGS"] = f"{flags} {_OPTION}{_own}".strip()
     if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "2") == "2":  # the package's own default, or inherited from a parent
         os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # TensorFlow logs an error for each file that it reads without one
-    atexit.register(_leave, _own)
+    atexit.register(_leave, _own, os.getpid())
 
 
 def publish() -> None:
@@ -72,9 +79,10 @@ def publish() -> None:
             path.unlink()
 
 
-def _leave(own: Path) -> None:
-    publish()
-    shutil.rmtree(own, ignore_errors=True)
+def _leave(own: Path, process: int) -> None:
+    if os.getpid() == process:  # not in a copy of it by fork
+        publish()
+        shutil.rmtree(own, ignore_errors=True)
 
 
 def _kind_of_code() -> str:

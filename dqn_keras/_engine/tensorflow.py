@@ -55,9 +55,7 @@ def _set_up_xla() -> None:
     if "xla_backend_extra_options" not in (flags := os.environ.get("XLA_FLAGS", "")):
         option = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000"
         os.environ["XLA_FLAGS"] = f"{flags} {option}".strip()
-    cache = os.environ.get("DQN_KERAS_CACHE", "1" if "ipykernel" in sys.modules else "0")
-    if cache != "0":
-        use_cache(None if cache == "1" else cache)
+    use_cache(os.environ.get("DQN_KERAS_CACHE", "1" if "ipykernel" in sys.modules else "0"))
 
 
 def require_tensorflow_backend(name: str) -> None:
