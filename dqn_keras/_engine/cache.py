@@ -1,7 +1,7 @@
 """A cache on disk of what XLA has compiled, so that another process need not compile it again.
 
 TensorFlow can keep such a cache, but it trusts every file in the folder and writes files in place. So each process gets
-a folder of its own, with copies of the shared folder's files, checked by the SHA-256 at the end of their names. `publish`
+its own folder, with copies of the shared folder's files, which are checked by the SHA-256 in their names. `publish`
 moves new files to the shared folder.
 
 This module does not import TensorFlow, because TensorFlow reads the setting at its import.
