@@ -43,13 +43,14 @@ def use_cache(choice: str) -> None:
     flags = re.sub(rf"{_OPTION}\S*/process-\S*", "", os.environ.pop("TF_XLA_FLAGS", "")).strip()  # a parent's folder
     if flags:
         os.environ["TF_XLA_FLAGS"] = flags
-    shared = Path(platformdirs.user_cache_dir("dqn_keras") if choice == "1" else choice) / _kind_of_code()
-    if choice == "0" or _OPTION in flags or any(map(str.isspace, str(shared))):  # TensorFlow splits flags at spaces
+    folder = platformdirs.user_cache_dir("dqn_keras") if choice == "1" else choice
+    if choice == "0" or _OPTION in flags or any(map(str.isspace, folder)):  # TensorFlow splits its flags at spaces
         return
     try:
+        shared = Path(folder) / _kind_of_code()
         shared.mkdir(parents=True, exist_ok=True)
         _own = Path(tempfile.mkdtemp(prefix="process-", dir=shared))
-    except OSError:
+    except (OSError, importlib.metadata.PackageNotFoundError):  # TensorFlow may be installed under another name
         return
     for path in shared.iterdir():
         with contextlib.suppress(OSError):  # another process has deleted it
