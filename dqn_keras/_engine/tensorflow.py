@@ -47,7 +47,7 @@ def _set_up_xla() -> None:
     """Sets how XLA compiles in this process, unless the user has.
 
     XLA compiles a small loop into one function. Its option, an undocumented one, raises the limit for that from 1 to
-    100 kB, so that compiled episodes are about 1.15 times as fast, with the same bits.
+    100 kB, so that compiled episodes are about 1.2 times as fast, with the same bits.
 
     DQN_KERAS_CACHE is 1 for a cache of compiled programs in the user's cache folder, 0 for none, or a folder for it.
     Notebooks and the command line have one by default.
