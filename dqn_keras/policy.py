@@ -20,7 +20,7 @@ def action(q_values: np.ndarray, epsilon: float, rng: np.random.Generator) -> in
         raise ValueError(f"q_values must be those of one state, [A] or [1, A], got shape {q_values.shape}")
     if rng.random() < epsilon:
         return int(rng.integers(q_values.shape[-1]))
-    return int(np.argmax(q_values))
+    return int(np.asarray(q_values).argmax())
 
 
 def decay_epsilon(epsilon: float, config: Config) -> float:

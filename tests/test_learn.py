@@ -320,3 +320,18 @@ def test_without_private_api_the_numbers_are_the_same(random_batch, monkeypatch)
     np.testing.assert_allclose(fast[1], slow[1], atol=1e-5)
     for a, b in zip(fast[2], slow[2], strict=True):
         np.testing.assert_array_equal(a[:10], b[:10])
+
+
+@pytest.mark.slow
+def test_a_version_without_the_fast_calls_gives_the_same_bits(monkeypatch):
+    def run():
+        runs = [train(env, Config(num_episodes=20, batch_size=16), seed=0, verbose=0) for env in environments]
+        return [np.concatenate([w.ravel() for w in run.q_network.get_weights()]) for run in runs]
+
+    environments = gym.make("CartPole-v1"), CartPole()
+    fast = run()
+    programs = importlib.import_module("dqn_keras._engine.programs")
+    monkeypatch.setattr(programs, "caller", lambda concrete: concrete.inference_fn.call_flat)
+    monkeypatch.setattr(programs, "_shared", {})
+    monkeypatch.setattr("dqn_keras.loops.gymnasium.tensor_maker", lambda: tf.constant)
+    np.testing.assert_array_equal(fast, run())

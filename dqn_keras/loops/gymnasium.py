@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dqn_keras._engine.numpy_acting import is_relu_mlp, q_values
+from dqn_keras._engine.private import tensor_maker
 from dqn_keras._engine.programs import Learner, bind
 from dqn_keras._engine.tensorflow import tf
 from dqn_keras.agent import Agent, DivergedError
@@ -75,6 +76,7 @@ class _InNumPy:
         num_metrics = len(Metrics._fields)
         self._ends = np.cumsum([num_metrics] + [math.prod(shape) for shape in self._shapes]).tolist()
         self._step = _bind_step(agent, config, formulas, gives_weights=True)
+        self._as_tensor = tensor_maker()
 
     def read_weights(self) -> None:
         """Reads the weights at the start of each episode, since a callback may have changed them."""
@@ -86,7 +88,7 @@ class _InNumPy:
 
     def update(self, rows: np.ndarray) -> Metrics:
         """Takes a gradient step on rows of the memory and returns its metrics."""
-        flat = self._step(tf.constant(rows))[0].numpy()
+        flat = self._step(self._as_tensor(rows))[0].numpy()
         parts = zip(self._ends, self._ends[1:], self._shapes, strict=False)
         self._weights = [flat[i:j].reshape(shape) for i, j, shape in parts]
         return Metrics(*flat[: self._ends[0]].tolist())
@@ -103,17 +105,18 @@ class _InTensorFlow:
         jit = config.jit_compile
         self._values = bind(make_values, [state], agent.learner, key="values", has_own_parts=False, jit_compile=jit)
         self._step = _bind_step(agent, config, formulas, gives_weights=False)
+        self._as_tensor = tensor_maker()
 
     def read_weights(self) -> None:
         """Does nothing: the weights are in the network."""
 
     def values(self, state: np.ndarray) -> np.ndarray:
         """Returns Q(s, .), [A]."""
-        return self._values(tf.constant(state))[0].numpy()
+        return self._values(self._as_tensor(state))[0].numpy()
 
     def update(self, rows: np.ndarray) -> Metrics:
         """Takes a gradient step on rows of the memory and returns its metrics."""
-        return Metrics(*self._step(tf.constant(rows))[0].numpy().tolist())
+        return Metrics(*self._step(self._as_tensor(rows))[0].numpy().tolist())
 
 
 def _bind_step(
