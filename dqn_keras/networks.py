@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dqn_keras._engine.made_here import _made_here
-from dqn_keras._engine.tensorflow import keras
+from dqn_keras._engine.tensorflow import keras, tf
 from dqn_keras.checks.numbers import check_count, check_counts
 
 
@@ -43,12 +43,12 @@ def _initializers(num_layers: int, seed: int | np.random.SeedSequence | None) ->
     return [keras.initializers.GlorotUniform(seed=int(s)) for s in seeds]
 
 
-def renew_weights(network: keras.Sequential, seed: int | np.random.SeedSequence | None) -> None:
-    """Sets a network of `make_q_network` to the weights that a new one for `seed` has."""
+def start_weights(network: keras.Sequential, seed: int | np.random.SeedSequence | None) -> list[tf.Tensor]:
+    """Returns the weights that a new network for `seed`, of the sizes of this one of `make_q_network`, starts with."""
     weights = []
     for layer, initializer in zip(network.layers, _initializers(len(network.layers), seed), strict=True):
-        weights += [initializer(layer.kernel.shape), np.zeros(layer.units, np.float32)]
-    network.set_weights(weights)
+        weights += [initializer(layer.kernel.shape), tf.zeros([layer.units])]
+    return weights
 
 
 def make_networks(

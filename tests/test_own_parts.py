@@ -247,9 +247,7 @@ def test_networks_that_differ_are_told_apart_whatever_they_are_called(cartpole, 
         return keras.Sequential([keras.Input((4,)), hidden, keras.layers.Dense(2)])
 
     train(cartpole, QUICK, seed=0, q_network=named("tanh"), checkpoint=tmp_path, verbose=0)
-    with pytest.raises(
-        ValueError, match=r"^q_network is 'Dense, Dense .*, got one .* computes something else"
-    ):
+    with pytest.raises(ValueError, match=r"^q_network is 'Dense, Dense .*, got one .* computes something else"):
         train(cartpole, QUICK, seed=0, q_network=named("sigmoid"), checkpoint=tmp_path, resume=True, verbose=0)
 
 

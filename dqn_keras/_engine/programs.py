@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from dqn_keras._engine.graphs import fingerprint
-from dqn_keras._engine.layers import _NarrowDense
+from dqn_keras._engine.layers import FewInputsDense, FewOutputsDense
 from dqn_keras._engine.made_here import units_if_made_here
 from dqn_keras._engine.private import (
     caller,
@@ -72,14 +72,19 @@ def stand_in(units: Sequence[int], jit_compile: bool) -> Learner:
 
     def make() -> keras.Sequential:
         network = make_q_network(num_features, num_actions, hidden_units, seed=0)
-        if not (jit_compile and 1 < num_actions <= 4):
-            return network
-        output = _NarrowDense.from_config(network.layers[-1].get_config())
-        return keras.Sequential([keras.Input((num_features,)), *network.layers[:-1], output])
+        layers = network.layers
+        if jit_compile and hidden_units and num_features <= _FEW_INPUTS:
+            layers[0] = FewInputsDense.from_config(layers[0].get_config())
+        if jit_compile and 1 < num_actions <= _FEW_OUTPUTS:
+            layers[-1] = FewOutputsDense.from_config(layers[-1].get_config())
+        return keras.Sequential([keras.Input((num_features,)), *layers])
 
     learner = Learner(make(), make(), keras.optimizers.Adam())
     learner.prepare()
     return learner
+
+
+_FEW_INPUTS = _FEW_OUTPUTS = 4
 
 
 class _Program(NamedTuple):

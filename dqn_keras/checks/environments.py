@@ -1,7 +1,7 @@
 """Checks of an environment's spaces, and of what a gymnasium.Env returns (compiled: `loops/compiled.py`, `_step`)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
@@ -10,6 +10,7 @@ from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras._engine.tensorflow import keras, require_xla, tf
 from dqn_keras.checks.networks import check_fits
+from dqn_keras.environments import key_of_twin
 
 
 class CheckedEnv:
@@ -125,6 +126,17 @@ _LARGEST = float(np.finfo(np.float32).max)
 def check_functional(env: FuncEnv) -> Spaces:
     """Returns the sizes of the environment's spaces; raises ValueError if the compiled loop cannot play it."""
     require_xla()
+    key = key_of_twin(env)
+    spaces = _spaces_of_twins.get(key) or _check_functions(env)
+    if key is not None:
+        _spaces_of_twins[key] = spaces
+    return spaces
+
+
+_spaces_of_twins: dict[Hashable, Spaces] = {}
+
+
+def _check_functions(env: FuncEnv) -> Spaces:
     name = type(env).__name__
     spaces = check_spaces(name, env.observation_space, env.action_space)
     rng = tf.constant([0, 0], tf.int64)

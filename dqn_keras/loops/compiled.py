@@ -6,10 +6,8 @@ an update. The random draws of a turn depend only on the run's seed, the episode
 
 import functools
 import math
-import sys
 import time
-from collections.abc import Callable, Generator, Hashable, Sequence
-from types import FunctionType, ModuleType
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +19,7 @@ from dqn_keras.agent import Agent, DivergedError
 from dqn_keras.checks.environments import Spaces
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
-from dqn_keras.environments import TWINS
+from dqn_keras.environments import key_of_twin
 from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, packages
 from dqn_keras.loops.draws import draw_bits, episode_key, reset_rng, sample_indices, step_rng, to_integer, to_uniform
 from dqn_keras.loops.updates import checked_step, is_all_finite
@@ -58,9 +56,11 @@ def episodes(
             epsilons.append(decay_epsilon(epsilons[-1], config))
         numbers = _numbers(env, agent, config, epsilons, min(at_once, config.num_episodes - first))
         played, *columns, fault = [x.numpy() for x in program(*map(tf.constant, numbers))]
-        totals = _Totals(*columns)
-        memory.rows[:] = rows.numpy()
-        memory.num_appended = int(num_appended.numpy())
+        totals = _Totals(*(x[:played] for x in columns))
+        appended = np.arange(memory.num_appended, num_appended.numpy())
+        changed = appended[-config.memory_size :] % config.memory_size
+        memory.rows[changed] = tf.gather(rows, changed)
+        memory.num_appended += len(appended)
         agent.num_updates += int(totals.updates.sum())
         agent.epsilon = decay_epsilon(epsilons[played - 1], config)
         if fault:
@@ -69,10 +69,7 @@ def episodes(
                 f"env {type(env).__name__}: {_FAULTS[fault]} was not finite in episode {first + played - 1}, "
                 + (f"step {steps - 1}" if steps else "at the reset")
             )
-        agent.episodes += [
-            totals.episode(i, number, epsilon)
-            for i, (number, epsilon) in enumerate(zip(range(first, first + played), epsilons, strict=False))
-        ]
+        agent.episodes += totals.episodes(first, epsilons)
         seconds = time.perf_counter() - start
         at_once = max(1, min(episodes_per_call, int(played * _SECONDS_PER_CALL / seconds)))
         yield from agent.episodes[first:]
@@ -134,8 +131,7 @@ def _bind_program(
 
     numbers = _numbers(env, agent, config, [0.0] * _CAPACITY, 0)
     specs = [tf.TensorSpec(x.shape, x.dtype) for x in numbers]
-    is_a_twin = type(env) in TWINS.values() and vars(env) == vars(type(env)())
-    environment = (type(env), _constants(type(env))) if is_a_twin else None
+    environment = key_of_twin(env)
     known = packages(formulas)
     return bind(
         make_program,
@@ -143,16 +139,9 @@ def _bind_program(
         agent.learner,
         variables,
         key=("episodes", environment, config.steps_per_update, config.batch_size, config.memory_size, known),
-        has_own_parts=not is_a_twin or known is None,
+        has_own_parts=environment is None or known is None,
         jit_compile=True,
     )
-
-
-def _constants(cls: type) -> Hashable:
-    """Returns the constants of an environment of this package: a user may change them to try other physics."""
-    named = vars(sys.modules[cls.__module__]) | vars(cls)
-    values = {name: x for name, x in named.items() if name[:2] != "__" and not isinstance(x, ModuleType | type)}
-    return tuple((name, x if isinstance(x, FunctionType) else (type(x), repr(x))) for name, x in values.items())
 
 
 _FAULTS = ("nothing", "an observation", "a reward", "the loss or a weight")
@@ -172,13 +161,15 @@ class _Totals(NamedTuple):
     updates: Any  # int32
     terminated: Any  # bool
 
-    def episode(self, i: int, number: int, epsilon: float) -> Episode:
-        """Returns the record of episode `i` of several."""
-        fact = _Totals(*(x[i].tolist() for x in self))
-        loss, mean_q, td_error = (x / fact.updates if fact.updates else math.nan for x in fact.sums)
-        max_q = fact.max_q if fact.updates else math.nan
-        measures = (loss, mean_q, max_q, td_error, fact.max_reward)
-        return Episode(number, fact.reward, fact.steps, epsilon, *measures, fact.terminated)
+    def episodes(self, first: int, epsilons: list[float]) -> list[Episode]:
+        """Returns the records of several episodes; `first` is the number of the first one."""
+        records = []
+        for i, totals in enumerate(zip(*(x.tolist() for x in self), strict=True)):
+            reward, steps, sums, max_q, max_reward, updates, terminated = totals
+            loss, mean_q, td_error = (x / updates if updates else math.nan for x in sums)
+            measures = (loss, mean_q, max_q if updates else math.nan, td_error, max_reward)
+            records.append(Episode(first + i, reward, steps, epsilons[i], *measures, terminated))
+        return records
 
 
 class _Loop:

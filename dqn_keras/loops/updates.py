@@ -30,4 +30,8 @@ def sum_up(metrics: Sequence[Metrics]) -> Metrics:
 def is_all_finite(*tensors: tf.Tensor) -> tf.Tensor:
     """Returns whether all numbers are finite, as a boolean scalar; integers always are."""
     floats = [x for x in map(tf.convert_to_tensor, tensors) if x.dtype.is_floating]
-    return tf.reduce_all([tf.reduce_all(tf.math.is_finite(x)) for x in floats])
+    if not floats:
+        return tf.constant(True)
+    dtype = floats[0].dtype if len({x.dtype for x in floats}) == 1 else tf.float64
+    numbers = tf.concat([tf.reshape(tf.cast(x, dtype), [-1]) for x in floats], axis=0)
+    return tf.reduce_all(tf.math.is_finite(numbers))
