@@ -7,6 +7,9 @@ soft update with each, epsilon held at 0.1. The programs take turns, round by ro
 that a machine that slows down slows all of them; a ratio is the median over the rounds of the ratio within a round.
 Imports and compilation are outside the timed part; the time to the first update, which holds the compilation, is
 printed apart.
+
+Left out are purejaxrl, which is not on PyPI, CleanRL, whose package there needs the old gym, and coax, which needs
+dm_control.
 """
 
 import argparse
@@ -19,6 +22,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium as gym
 
@@ -114,7 +118,18 @@ def stable_baselines3() -> Callable[[int], int]:
     from stable_baselines3 import DQN
 
     torch.set_num_threads(1)
-    model = DQN(
+    return _baseline(DQN)
+
+
+def sbx() -> Callable[[int], int]:
+    """Stable-Baselines3's loop; the learning step is compiled by JAX."""
+    from sbx import DQN
+
+    return _baseline(DQN)
+
+
+def _baseline(algorithm: Any) -> Callable[[int], int]:
+    model = algorithm(
         "MlpPolicy",
         gym.make("CartPole-v1"),
         learning_rate=CONFIG.alpha,
@@ -153,6 +168,7 @@ def main() -> None:
     }
     for module, name, make in [
         ("stable_baselines3", "Stable-Baselines3", stable_baselines3),
+        ("sbx", "SBX (Stable-Baselines3's loop, JAX)", sbx),
         ("rejax", "rejax", rejax),
     ]:
         if importlib.util.find_spec(module):
@@ -162,8 +178,8 @@ def main() -> None:
             programs[name] = make
         else:
             print(f'{name} is left out: pip install "dqn_keras[benchmarks]"', file=sys.stderr)
-    packages = ["tensorflow", "keras", "gymnasium", "numpy", "stable-baselines3", "rejax", "jax"]
-    installed = [p for p in packages if importlib.util.find_spec(p.replace("-", "_"))]
+    packages = ["tensorflow", "keras", "gymnasium", "numpy", "stable-baselines3", "sbx-rl", "rejax", "jax"]
+    installed = [p for p in packages if importlib.util.find_spec(p.removesuffix("-rl").replace("-", "_"))]
     versions = [f"{p} {importlib.metadata.version(p)}" for p in installed]
     print("# Env steps per second\n")
     print(

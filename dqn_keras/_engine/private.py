@@ -50,12 +50,10 @@ def caller(concrete: Any) -> Callable[..., list[tf.Tensor]]:
 def tensor_maker() -> Callable[[np.ndarray], tf.Tensor]:
     """Returns a faster `tf.constant` for arrays that nobody changes: a tensor may share the memory of its array."""
     try:
-        from tensorflow.python.eager.context import context
         from tensorflow.python.framework.ops import EagerTensor
 
-        device = context().device_name
-        if np.array_equal(EagerTensor(np.ones(2, np.float32), device, None), [1, 1]):
-            return lambda array: EagerTensor(array, device, None)
+        if np.array_equal(EagerTensor(np.ones(2, np.float32), None, None), [1, 1]):
+            return lambda array: EagerTensor(array, None, None)  # the first None: in the CPU's memory
     except Exception:  # another version can raise anything
         pass
     return tf.constant

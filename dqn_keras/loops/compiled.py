@@ -57,10 +57,8 @@ def episodes(
         numbers = _numbers(env, agent, config, epsilons, min(at_once, config.num_episodes - first))
         played, *columns, fault = [x.numpy() for x in program(*map(tf.constant, numbers))]
         totals = _Totals(*(x[:played] for x in columns))
-        appended = np.arange(memory.num_appended, num_appended.numpy())
-        changed = appended[-config.memory_size :] % config.memory_size
-        memory.rows[changed] = tf.gather(rows, changed)
-        memory.num_appended += len(appended)
+        memory.rows[:] = rows.read_value()
+        memory.num_appended = int(num_appended.numpy())
         agent.num_updates += int(totals.updates.sum())
         agent.epsilon = decay_epsilon(epsilons[played - 1], config)
         if fault:
