@@ -7,9 +7,12 @@ seed once more in the same process, where nothing is left to compile: that is th
 leaves to Python's garbage collector is collected in between.) Last, in the same way, a longer whole run: 400 episodes
 without a stop rule, some 50,000 env steps. A second process then does the same with the cache of compiled programs that
 the first one has filled, as the command line and notebooks do (`DQN_KERAS_CACHE`).
+
+Run it in an environment without the extra `benchmarks`, with the package alone.
 """
 
 import argparse
+import importlib.util
 import os
 import statistics
 import subprocess
@@ -50,7 +53,8 @@ def main() -> None:
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # Linux; the processes inherit it
     print("# From nothing to solved\n")
     print(f"`python -m benchmarks.solve --seeds {arguments.seeds}`: a fresh process for each seed, one core. Training")
-    print("holds all of a run but its compilation, the building of its networks too.\n")
+    print("holds all of a run but its compilation, the building of its networks too. JAX, which Keras and TensorFlow")
+    print(f"import wherever it is, is {'' if importlib.util.find_spec('jax') else 'not '}installed.\n")
     print(
         "| seed | start to solved, s | second process, s | imports, s | trace, compile, s | training, s "
         "| env steps/s of it | env steps/s of 400 episodes | solved at |"

@@ -26,4 +26,4 @@ def key_of_twin(env: Any) -> Hashable | None:
     return cls, tuple((name, x if isinstance(x, FunctionType) else (type(x), repr(x))) for name, x in values.items())
 
 
-__all__ = ["TWINS", "Acrobot", "CartPole", "MountainCar", "key_of_twin"]
+__all__ = ["TWINS", "Acrobot", "CartPole", "MountainCar"]
