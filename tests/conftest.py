@@ -1,5 +1,6 @@
 import importlib
 import os
+import signal
 import subprocess
 import sys
 
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 
 os.environ.setdefault("DQN_KERAS_CACHE", "0")  # tests leave nothing in the user's folders
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a background job; tests and their processes are interrupted
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture
