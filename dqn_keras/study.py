@@ -319,18 +319,49 @@ def _load(path: Path, facts: dict[str, Any]) -> dict[int, Outcome]:
 
 
 def _read(path: Path) -> tuple[dict[int, Outcome], dict[str, Any]]:
+    """Returns the outcomes by seed, and the facts of the study; nothing in the file is taken on trust."""
     try:
         columns, facts = from_bytes(path.read_bytes())
-        return {
-            seed: Outcome(seed, columns[f"{seed}/rewards"], columns[f"{seed}/steps"], solved_at, bytes.fromhex(digest))
-            for seed, solved_at, digest in facts["seeds"]
-        }, facts
-    except (ValueError, KeyError) as error:
+        config = _config(facts)
+        outcomes = {}
+        for seed, solved_at, digest in facts["seeds"]:
+            if seed in outcomes:
+                raise ValueError(f"seed {seed} is in it twice")
+            rewards, steps = columns[f"{seed}/rewards"], columns[f"{seed}/steps"]
+            outcomes[seed] = Outcome(seed, rewards, steps, solved_at, bytes.fromhex(digest))
+            _check_outcome(outcomes[seed], config)
+    except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"file {path} is not a study that can be loaded: {error}") from error
+    return outcomes, facts
+
+
+def _config(facts: dict[str, Any]) -> Config:
+    return Config(**{**facts["config"], "hidden_units": tuple(facts["config"]["hidden_units"])})
+
+
+def _check_outcome(outcome: Outcome, config: Config) -> None:
+    seed, rewards, steps, solved_at, _ = outcome
+    check_count("seeds", seed, at_least=0)
+    if solved_at is not None:
+        check_count("solved_at", solved_at)
+    is_right = (
+        rewards.ndim == 1
+        and rewards.shape == steps.shape
+        and (solved_at or 1) <= len(rewards) <= config.num_episodes
+        and rewards.dtype == np.float64
+        and steps.dtype == np.int64
+        and bool(np.isfinite(rewards).all() and (steps > 0).all())
+    )
+    if not is_right:
+        raise ValueError(f"the episodes of seed {seed} are not as `study` records them")
 
 
 def load_study(path: str | os.PathLike) -> Study:
-    """Loads the study that `study(..., file=path)` saved, with all its seeds in ascending order."""
+    """Loads the study that `study(..., file=path)` saved, with all its seeds in ascending order.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged, or something in it cannot be from a study; the message names the file.
+    """
     outcomes, facts = _read(Path(path))
-    fields = {**facts["config"], "hidden_units": tuple(facts["config"]["hidden_units"])}
-    return Study(Config(**fields), list(outcomes.values()))
+    return Study(_config(facts), list(outcomes.values()))

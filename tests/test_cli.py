@@ -210,7 +210,7 @@ def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(number, code):
 ERRORS = {
     "train CartPole-v1 --tau 3": "tau must be a finite number above 0, at most 1, got 3.0",
     "train Nope-v1": "Environment `Nope` doesn't exist.",
-    "train no_module:Nope-v1": "No module named 'no_module'.",
+    "train no_module:Nope-v1": "No module named 'no_module'",
     "train FrozenLake-v1": "FrozenLake-v1 has the observation space Discrete(16); --flatten makes one axis of it",
     "train Pendulum-v1": "env Pendulum-v1 has the action space Box(-2.0, 2.0, (1,), float32); supported is Discrete",
     "train CarRacing-v3 --env-args continuous=False": "env CarRacing-v3 has observations of shape (96, 96, 3)",

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ import numpy as np
 
 from dqn_keras.checks.numbers import check_count
 from dqn_keras.cli import run_folder
+from dqn_keras.cli.options import how_to_resume
 from dqn_keras.cli.run_folder import EnvOptions, Settings
 from dqn_keras.evaluation import evaluate as play_greedily
 from dqn_keras.rendering import record_episode, save_animation
@@ -28,18 +28,20 @@ def train(options: "cli.Train") -> int:
     seed = checked_seed(options.seed)
     folder = options.out or _default_folder(options.env, str(seed))
     settings = Settings(_env_options(options), seed, options.config, options.tensorboard)
-    return _tell(run_folder.begin(folder, settings, _verbosity(options.quiet)), folder, options.quiet)
+    return _tell(run_folder.begin(folder, settings, _verbosity(options.quiet)), folder, options)
 
 
 def resume(options: "cli.Resume") -> int:
     """Continues the run of a folder."""
-    run = run_folder.resume(options.folder, options.num_episodes, _verbosity(options.quiet))
-    return _tell(run, options.folder, options.quiet)
+    verbose = _verbosity(options.quiet)
+    run = run_folder.resume(options.folder, options.num_episodes, verbose, options.import_module)
+    return _tell(run, options.folder, options)
 
 
 def watch(options: "cli.Watch") -> int:
     """Plays greedily in a window, or writes a GIF."""
-    settings, network = run_folder.read_settings(options.folder), run_folder.read_q_network(options.folder)
+    settings = run_folder.read_settings_to_play(options.folder, options.import_module)
+    network = run_folder.read_q_network(options.folder)
     max_steps = settings.config.max_steps
     if _has_display() and not options.gif:
         with contextlib.closing(settings.env.make(render_mode="human")) as env:
@@ -57,7 +59,8 @@ def watch(options: "cli.Watch") -> int:
 
 def evaluate(options: "cli.Evaluate") -> int:
     """Plays greedily and prints the returns."""
-    settings, network = run_folder.read_settings(options.folder), run_folder.read_q_network(options.folder)
+    settings = run_folder.read_settings_to_play(options.folder, options.import_module)
+    network = run_folder.read_q_network(options.folder)
     with contextlib.closing(settings.env.make()) as env:
         _print_returns(play_greedily(env, network, options.episodes, options.seed, settings.config.max_steps))
     return 0
@@ -102,11 +105,11 @@ def _default_folder(env_id: str, name: str) -> Path:
     return Path("runs", f"{env_id.replace('/', '-').replace(':', '-')}-{name}")
 
 
-def _tell(run: Run, folder: Path, quiet: bool) -> int:
+def _tell(run: Run, folder: Path, options: "cli.Train | cli.Resume") -> int:
     """Prints how a run has ended, and returns the exit code."""
     if run.interrupted:
-        return _interrupted(f"dqn-keras resume {shlex.quote(str(folder))}")
-    if not quiet:
+        return _interrupted(how_to_resume(options, folder))
+    if not options.quiet:
         if run.solved_at is None:
             print(f"Not solved within {len(run.rewards):,} episodes")
         print(f"The run is in {folder}; its curves are in curve.png")

@@ -4,6 +4,7 @@ TensorFlow and Gymnasium are imported only when a command runs, so that `--help`
 """
 
 import dataclasses
+import importlib
 import os
 import re
 import shlex
@@ -23,6 +24,9 @@ Flag = FlagCreatePairsOff[bool]
 
 
 Folder = Annotated[Positional[Path], arg(metavar="FOLDER")]
+
+
+Module = Annotated[str | None, arg(name="import", metavar="MODULE", help_behavior_hint="(default: none)")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,11 +74,22 @@ class Train(_Task):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Resume:
-    """Continue an interrupted or killed run, or make a run longer: bit for bit as without a break."""
+class _Kept:
+    """A run that is kept in a folder."""
 
     folder: Folder
     """Folder of the run."""
+    import_module: Annotated[str | None, arg(name="import", metavar="MODULE", help_behavior_hint="(default: none)")] = (
+        None
+    )
+    """Module that registers the environment, from the current folder or installed. Importing it runs its code, so it
+    must be named here; a folder's own files never import anything."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Resume(_Kept):
+    """Continue an interrupted or killed run, or make a run longer: bit for bit as without a break."""
+
     num_episodes: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: as before)")] = None
     """Maximum number of episodes."""
     quiet: Flag = False
@@ -82,11 +97,9 @@ class Resume:
 
 
 @dataclasses.dataclass(kw_only=True)
-class Watch:
-    """Watch the agent play in a window or, without a display, in a GIF."""
+class Watch(_Kept):
+    """Watch the agent play in a window or, without a display, in a GIF, which is written to the folder."""
 
-    folder: Folder
-    """Folder of the run; the GIF is written there."""
     episodes: int = 3
     """Number of episodes in the window; the GIF shows only the first."""
     seed: int = 0
@@ -96,11 +109,9 @@ class Watch:
 
 
 @dataclasses.dataclass(kw_only=True)
-class Evaluate:
+class Evaluate(_Kept):
     """Let the agent play greedily, from start states that differ from those in training."""
 
-    folder: Folder
-    """Folder of the run."""
     episodes: int = 100
     """Number of episodes."""
     seed: int = 0
@@ -153,10 +164,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("DQN_KERAS_CACHE", "1")
     os.environ.setdefault("MPLBACKEND", "Agg")
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    sys.path.append(os.getcwd())  # MODULE:ID looks here too, however this was started
     command = None
     try:
         command = parse(arguments)
+        _import_from_this_folder(command)
         from dqn_keras.cli import commands
 
         warnings.formatwarning = lambda message, *_: f"dqn-keras: {_in_plain_text(str(message))}\n"
@@ -176,11 +187,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _error(str(error))
 
 
+def _import_from_this_folder(command: Any) -> None:
+    """Imports the module that was typed, if any; only then the current folder is searched for modules."""
+    if module := _module_of(command):
+        sys.path.append(os.getcwd())
+        importlib.import_module(module)
+
+
+def _module_of(command: Any) -> str | None:
+    return command.env.rpartition(":")[0] if isinstance(command, _Task) else getattr(command, "import_module", None)
+
+
+def how_to_resume(command: Any, folder: Path) -> str:
+    """Returns the command that continues the run of `command`, which is in `folder`."""
+    module = _module_of(command)
+    return f"dqn-keras resume {shlex.quote(str(folder))}" + (f" --import {module}" if module else "")
+
+
 def _how_to_go_on(command: Any) -> str:
     """Returns a hint on how to continue, if the run has begun."""
     folder = getattr(command, "folder", None) or getattr(command, "out", None)
     is_run = isinstance(command, Train | Resume) and folder is not None and (folder / "config.json").exists()
-    return f". To continue: dqn-keras resume {shlex.quote(str(folder))}" if is_run else ""
+    return f". To continue: {how_to_resume(command, cast(Path, folder))}" if is_run else ""
 
 
 def _says_it_all(error: Exception) -> bool:

@@ -110,9 +110,27 @@ def read_settings(folder: Path) -> Settings:
         content = json.loads(path.read_text())
         config = {**content["config"], "hidden_units": tuple(content["config"]["hidden_units"])}
         env = EnvOptions(**content["environment"])
+        if not (isinstance(env.id, str) and isinstance(env.arguments, dict)):
+            raise TypeError("the environment must have an id and arguments")
         return Settings(env, content["seed"], Config(**config), content["tensorboard"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not as `dqn-keras train` writes it: {error}") from None
+
+
+def read_settings_to_play(folder: Path, imported: str | None) -> Settings:
+    """Reads config.json for making its environment; raises an error if that would import a module not `imported`.
+
+    Gymnasium imports the module in an id MODULE:ID, and so would run code that the sender of a folder has chosen.
+    """
+    settings = read_settings(folder)
+    for name in (settings.env.id, settings.env.arguments.get("env_id", "")):
+        module, is_named, _ = str(name).rpartition(":")
+        if is_named and module != imported:
+            raise ValueError(
+                f"{folder} names the module {module!r}, which is not imported unasked, because that runs its code; "
+                f"if you trust it: --import {module}"
+            )
+    return settings
 
 
 def read_q_network(folder: Path) -> keras.Model:
@@ -138,9 +156,9 @@ def begin(folder: Path, settings: Settings, verbose: int) -> Run:
     return _train(folder, env, settings, verbose, resume=False)
 
 
-def resume(folder: Path, num_episodes: int | None, verbose: int) -> Run:
+def resume(folder: Path, num_episodes: int | None, verbose: int, imported: str | None = None) -> Run:
     """Continues a run, with another maximum number of episodes if `num_episodes` is given."""
-    before = settings = read_settings(folder)
+    before = settings = read_settings_to_play(folder, imported)
     if num_episodes is not None:
         config = dataclasses.replace(settings.config, num_episodes=num_episodes)
         settings = dataclasses.replace(settings, config=config)

@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import io
 import json
+import math
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -35,15 +36,28 @@ def from_bytes(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if hashlib.sha256(body).digest() != digest:
         raise DamagedError("its SHA-256 is not that of its content, so that it has been cut short or changed")
     try:
-        with np.load(io.BytesIO(body), allow_pickle=False) as archive:
-            arrays = dict(archive)
+        with zipfile.ZipFile(io.BytesIO(body)) as archive:
+            if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+                raise ValueError("a part is compressed")  # it could be of any size
+            arrays = {part.removesuffix(".npy"): _read_array(archive.read(part)) for part in archive.namelist()}
         facts = json.loads(arrays.pop("facts").tobytes())
         file_format = facts["format"]
-    except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:
+    except (KeyError, TypeError, ValueError, OSError, RecursionError, zipfile.BadZipFile) as error:
         raise DamagedError(f"it is not a checkpoint ({error})") from None
     if file_format != FORMAT:
         raise DamagedError(f"its format is {file_format!r}, and dqn_keras {__version__} reads {FORMAT}")
     return arrays, facts
+
+
+def _read_array(content: bytes) -> np.ndarray:
+    """Returns the array in the content of an .npy file, once its header is found to fit its size."""
+    file = io.BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(file)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content) - file.tell():
+        raise ValueError("the shape of an array does not fit its data")
+    return np.load(io.BytesIO(content), allow_pickle=False)
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ import os
 import zipfile
 from pathlib import Path
 
+import h5py
 import numpy as np
 
 from dqn_keras._engine.copies import check_is_equal, finalize_layers, python_random_kept
@@ -38,6 +39,16 @@ def save_q_network(path: str | os.PathLike, q_network: keras.Model) -> None:
         network.save(temporary)
 
 
+def _check_weights(group: h5py.Group) -> None:
+    """Raises ValueError if an array is a link, or larger than what the file holds of it."""
+    for name in group:
+        is_here = isinstance(group.get(name, getlink=True), h5py.HardLink)
+        if is_here and isinstance(group[name], h5py.Group):
+            _check_weights(group[name])
+        elif not (is_here and group[name].id.get_storage_size() == group[name].nbytes):
+            raise ValueError(f"{group.name}/{name} in model.weights.h5 is not as Keras writes it")
+
+
 def load_q_network(path: str | os.PathLike) -> keras.Model:
     """Returns the network saved by `run.save`, for `evaluate` or any other use of a Keras model.
 
@@ -50,8 +61,13 @@ def load_q_network(path: str | os.PathLike) -> keras.Model:
     path = Path(path)
     try:
         with zipfile.ZipFile(path) as archive:
+            for part in archive.infolist():
+                if part.compress_type != zipfile.ZIP_STORED:  # Keras never does; it could unpack to any size
+                    raise ValueError(f"{part.filename} in it is compressed")
             if (broken := archive.testzip()) is not None:  # Keras reads only parts, and so checks no checksum
                 raise ValueError(f"{broken} in it is damaged")
+            with archive.open("model.weights.h5") as file, h5py.File(file, "r") as weights:
+                _check_weights(weights)
         network = keras.saving.load_model(path, compile=False, safe_mode=True)
         check_network("it", network)
         if not all(np.isfinite(w).all() for w in network.get_weights()):
