@@ -3,8 +3,8 @@
     python -m benchmarks.anatomy > results/anatomy.md
 
 A part is timed as the best of forty passes over 3,000 turns of its loop. The parts do not add up to the whole exactly:
-compiled together, they are fused in other ways. XLA's program for a part is a list of kernels that run one after the
-other; a small loop, such as that of the env steps, is one kernel.
+compiled together, they are fused in other ways. XLA compiles a part to kernels, which it runs one by one. It compiles a
+small loop, such as the four env steps of a turn, to a single kernel.
 """
 
 import os

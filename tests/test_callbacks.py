@@ -179,3 +179,16 @@ def test_the_numbers_of_a_resumed_run_are_those_of_the_whole_run(env, tmp_path):
         np.testing.assert_array_equal(heard.history[name], whole.history[name][15:])
     assert np.isnan(run.history["steps_per_second"][:15]).all()
     assert (np.array(run.history["steps_per_second"][15:]) > 0).all()
+
+
+@pytest.mark.slow
+def test_a_csv_loggers_rows_are_those_that_keras_writes(env, tmp_path):
+    class KerasOwn(keras.callbacks.CSVLogger):
+        """Not exactly a CSVLogger, so that its own `on_epoch_end` is called."""
+
+    for kind, options in [("fast", {}), ("append", {"append": True, "separator": ";"})]:
+        fast, slow = tmp_path / f"{kind}.csv", tmp_path / f"{kind}_keras.csv"
+        for _ in range(2):
+            play(env, keras.callbacks.CSVLogger(fast, **options), KerasOwn(slow, **options))
+        assert fast.read_bytes() == slow.read_bytes()
+        assert len(fast.read_text().splitlines()) > 3
