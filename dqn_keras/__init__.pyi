@@ -2,6 +2,7 @@ from . import environments as environments
 from .agent import Agent as Agent
 from .config import Config as Config
 from .evaluation import evaluate as evaluate
+from .interruption import TrainingInterrupted as TrainingInterrupted
 from .learn import double_td_targets as double_td_targets
 from .learn import learn as learn
 from .learn import loss_values as loss_values

@@ -1,7 +1,7 @@
-"""Keras callbacks in a run: each episode is an epoch of one batch."""
+"""Keras callbacks in a run, called in the order of `model.fit`: each episode is an epoch of one batch."""
 
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from dqn_keras._engine.tensorflow import keras
@@ -12,65 +12,66 @@ if TYPE_CHECKING:
     from dqn_keras.training import Run
 
 
-def with_callbacks(
-    episodes: Iterator[Episode],
-    run: "Run",
-    callbacks: Sequence[keras.callbacks.Callback],
-    before_end: Callable[[], None],
-) -> Generator[Episode, None, None]:
-    """Yields the same episodes and reports each to the callbacks, until one of them asks to stop.
+class Listeners:
+    """The callbacks of a run. As in `fit`, nothing more is called after an exception."""
 
-    If learning diverges, TerminateOnNaN asks to stop, and then there is no error. `before_end` is called before the
-    callbacks' `on_train_end`.
-    """
-    network, log, num_episodes = run.q_network, Log(run.config), run.config.num_episodes
-    network.stop_training = False
-    listeners = keras.callbacks.CallbackList(callbacks, model=network, epochs=num_episodes, steps=1, verbose=0)
-    for episode, speed in zip(run.episodes, run.steps_per_second, strict=True):
-        log.add(episode, speed)
-    listeners.on_train_begin()
-    for callback in listeners.callbacks:
-        if isinstance(callback, keras.callbacks.CSVLogger):
-            callback.keys = sorted(LOGGED)  # or it adds an empty column val_NAME for each, at the same cost
-    try:
-        for number in range(len(run.episodes), num_episodes):
+    def __init__(self, run: "Run", callbacks: Sequence[keras.callbacks.Callback]) -> None:
+        self._run, self._network, self._num_episodes = run, run.q_network, run.config.num_episodes
+        self.callbacks = list(callbacks)
+        self._list = keras.callbacks.CallbackList(
+            self.callbacks, model=self._network, epochs=self._num_episodes, steps=1, verbose=0
+        )
+        self._log = Log(run.config)
+        self._last_logs: dict[str, float] | None = None
+        for episode, speed in zip(run.episodes, run.steps_per_second, strict=True):
+            self._log.add(episode, speed)
+
+    def begin(self) -> None:
+        """Calls `on_train_begin`."""
+        self._network.stop_training = False
+        self._list.on_train_begin()
+        for callback in self.callbacks:
+            if isinstance(callback, keras.callbacks.CSVLogger):
+                callback.keys = sorted(LOGGED)  # or it adds an empty column val_NAME for each, at the same cost
+
+    def end(self) -> None:
+        """Calls `on_train_end`."""
+        self._list.on_train_end(self._last_logs)
+
+    def heard(self, episodes: Iterator[Episode]) -> Generator[Episode, None, None]:
+        """Yields the same episodes and reports each to the callbacks, until one of them asks to stop.
+
+        If learning diverges, TerminateOnNaN asks to stop, and then there is no error.
+        """
+        for number in range(len(self._run.episodes), self._num_episodes):
+            self._tell("on_epoch_begin", number, {})
+            self._tell("on_train_batch_begin", 0, {})
             try:
-                yield _told(episodes, number, log, run, listeners.callbacks)
+                episode = next(episodes)
             except DivergedError:
-                if not network.stop_training:
+                self._tell("on_train_batch_end", 0, {"loss": math.nan})
+                if not self._network.stop_training:
                     raise
-                run.diverged = True
+                self._run.diverged = True
+                self._end_epoch(number, dict.fromkeys(LOGGED, math.nan))
                 return
-            if network.stop_training:
+            logs = self._log.add(episode, self._run.steps_per_second[number])
+            self._tell("on_train_batch_end", 0, {} if math.isnan(episode.loss) else {"loss": episode.loss})
+            self._end_epoch(number, logs)
+            yield episode
+            if self._network.stop_training:
                 return
-    finally:
-        before_end()
-        listeners.on_train_end()
 
-
-def _told(
-    episodes: Iterator[Episode], number: int, log: Log, run: "Run", callbacks: Sequence[keras.callbacks.Callback]
-) -> Episode:
-    """Plays the next episode and reports it to the callbacks."""
-
-    def tell(event: str, number: int, logs: dict[str, float]) -> None:
-        for callback in callbacks:  # a CallbackList's own methods take 50 us: they look for tensors in the logs
+    def _tell(self, event: str, number: int, logs: dict[str, float]) -> None:
+        for callback in self.callbacks:  # a CallbackList's own methods take 50 us: they look for tensors
             getattr(callback, event)(number, logs)
 
-    tell("on_epoch_begin", number, {})
-    tell("on_train_batch_begin", 0, {})
-    try:
-        episode = next(episodes)
-    except DivergedError:
-        tell("on_train_batch_end", 0, {"loss": math.nan})
-        raise
-    logs = log.add(episode, run.steps_per_second[number])
-    tell("on_train_batch_end", 0, {} if math.isnan(episode.loss) else {"loss": episode.loss})
-    for callback in callbacks:
-        if type(callback) is keras.callbacks.CSVLogger and callback.writer:
-            # The same row as its on_epoch_end writes, without a search for arrays in the logs.
-            callback.writer.writer.writerow([number, *map(logs.get, callback.keys)])
-            callback.csv_file.flush()
-        else:
-            callback.on_epoch_end(number, logs)
-    return episode
+    def _end_epoch(self, number: int, logs: dict[str, float]) -> None:
+        self._last_logs = logs
+        for callback in self.callbacks:
+            if type(callback) is keras.callbacks.CSVLogger and callback.writer:
+                # The same row as its on_epoch_end writes, without a search for arrays in the logs.
+                callback.writer.writer.writerow([number, *map(logs.get, callback.keys)])
+                callback.csv_file.flush()
+            else:
+                callback.on_epoch_end(number, logs)

@@ -4,7 +4,31 @@ import contextlib
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dqn_keras.training import Run
+
+
+class TrainingInterrupted(KeyboardInterrupt):
+    """Raised by `train` at the end of an episode, after Ctrl-C, an interrupted notebook cell or SIGTERM.
+
+    It is a KeyboardInterrupt, so that it also ends the loop or the script around `train`.
+    """
+
+    run: "Run"
+    """The run up to its last episode."""
+
+    def __init__(self, run: "Run", folder: Path | None) -> None:
+        super().__init__(run, folder)
+        self.run, self._folder = run, folder
+
+    def __str__(self) -> str:
+        after = f"after {len(self.run.episodes)} episodes"
+        if self._folder is None:
+            return f"{after}; the exception's `run` has them (in a notebook: sys.last_value.run)"
+        return f"{after}, which are saved in {self._folder}; train(..., resume=True) continues"
 
 
 @contextlib.contextmanager

@@ -41,12 +41,9 @@ class Progress:
             average = round(float(np.mean(last)), 2)
             say(f"Episode {episode.number}, Reward: {episode.reward}, Last 100 Average: {average}")
 
-    def show_end(self, folder: object | None) -> None:
-        """Prints whether the run is solved, or was interrupted and where it is kept."""
+    def show_end(self) -> None:
+        """Prints whether the run is solved."""
         run = self._run
         if self._verbose and run.solved_at is not None:
             average = round(float(np.mean(run.rewards[-run.config.solved_window :])), 2)
             print(f"Solved with {average} reward in {run.solved_at} episodes!")
-        elif self._verbose and run.interrupted:
-            kept = f", kept in {folder}" if folder else ""
-            print(f"Interrupted after {len(run.episodes)} episodes{kept}")

@@ -12,7 +12,7 @@ import threading
 import time
 import uuid
 import warnings
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -31,8 +31,9 @@ from dqn_keras._engine.tensorflow import tf
 from dqn_keras.checks.numbers import check_count
 from dqn_keras.checks.run import check_arguments
 from dqn_keras.config import Config
+from dqn_keras.interruption import TrainingInterrupted
 from dqn_keras.progress import tqdm
-from dqn_keras.storage.files import FORMAT, from_bytes, replacing, to_bytes
+from dqn_keras.storage.files import FORMAT, from_bytes, locked, replacing, to_bytes
 from dqn_keras.storage.identity import check_is_same, identity_of_study
 from dqn_keras.storage.parts import describe
 from dqn_keras.storage.versions import warn_of_other_versions
@@ -122,7 +123,9 @@ def study(
         verbose: 1 shows a progress bar, 0 nothing.
 
     Raises:
-        TypeError, ValueError: as for `train`; or `file` is of another study (the message begins with what differs).
+        TypeError, ValueError: as for `train`; or `file` is of another study (the message begins with what differs), or
+            another process is writing it.
+        OSError: `file` cannot be written.
     """
     check_arguments(env, config, verbose)
     seeds = [check_count("seeds", seed, at_least=0) for seed in seeds]
@@ -131,28 +134,21 @@ def study(
     if engine not in _ENGINES:
         raise ValueError(f"engine must be one of {', '.join(_ENGINES)}, got {engine!r}")
     num_workers = cpu_count() if num_workers is None else check_count("num_workers", num_workers)
-    facts = {} if file is None else {"format": FORMAT, **identity_of_study(env, config)}
-    outcomes = {} if file is None else _load(Path(file), facts)
-
-    missing = [seed for seed in seeds if seed not in outcomes]
-    bar = tqdm(total=len(seeds), initial=len(seeds) - len(missing), unit="seed", disable=not verbose)
-    saved_at, interrupted = time.monotonic(), False
-    with bar, contextlib.closing(_ENGINES[engine](_pickled_env(env), config, missing, num_workers)) as results:
-        try:
-            for outcome in results:
-                if outcome is None:  # a run in this process was asked to stop
-                    interrupted = True
-                    break
-                outcomes[outcome.seed] = outcome
-                bar.update()
-                if file is not None and time.monotonic() > saved_at + _SECONDS_BETWEEN_SAVES:
-                    _save(Path(file), outcomes, facts)
-                    saved_at = time.monotonic()
-        except KeyboardInterrupt:
-            interrupted = True
-        finally:
-            if file is not None and missing:
-                _save(Path(file), outcomes, facts)
+    interrupted = False
+    with _kept_in(file, seeds, env, config) as (outcomes, save_when_due):
+        missing = [seed for seed in seeds if seed not in outcomes]
+        bar = tqdm(total=len(seeds), initial=len(seeds) - len(missing), unit="seed", disable=not verbose)
+        with bar, contextlib.closing(_ENGINES[engine](_pickled_env(env), config, missing, num_workers)) as results:
+            try:
+                for outcome in results:
+                    if outcome is None:  # its run was asked to stop
+                        interrupted = True
+                        break
+                    outcomes[outcome.seed] = outcome
+                    bar.update()
+                    save_when_due()
+            except KeyboardInterrupt:
+                interrupted = True
     if interrupted:
         unfinished = sum(seed not in outcomes for seed in seeds)
         warnings.warn(f"{unfinished} of {len(seeds)} seeds are not in this study: it was interrupted", stacklevel=2)
@@ -219,9 +215,10 @@ def _parts(env_copy: _PickledEnv) -> tuple[gym.Env | FuncEnv, dict]:
 def _train_seed(env_copy: _PickledEnv, config: Config, seed: int) -> Outcome | None:
     """Trains one seed in this process; returns None if it was interrupted."""
     env, programs = _parts(env_copy)
-    with shared_in(programs):
-        run = train(env, config, seed, verbose=0)
-    if run.interrupted:
+    try:
+        with shared_in(programs):
+            run = train(env, config, seed, verbose=0)
+    except TrainingInterrupted:
         return None
     weights = [*run.q_network.get_weights(), *run.q_hat_network.get_weights()]
     digest = hashlib.sha256(b"".join(w.tobytes() for w in weights)).digest()
@@ -299,11 +296,49 @@ def _by_ray(env_copy: _PickledEnv, config: Config, seeds: list[int], _: int) -> 
 _ENGINES = {"joblib": _by_joblib, "ray": _by_ray}
 
 
+@contextlib.contextmanager
+def _kept_in(
+    file: str | os.PathLike | None, seeds: Sequence[int], env: gym.Env | FuncEnv, config: Config
+) -> Iterator[tuple[dict[int, Outcome], Callable[[], None]]]:
+    """Yields the outcomes in a study's file, by seed, and a function that saves them when it is time; saves at the end.
+
+    Nobody else can write the file meanwhile. If it cannot be written, that is an error at the start, and a warning
+    later.
+    """
+    if file is None:
+        yield {}, lambda: None
+        return
+    path, facts = Path(file), {"format": FORMAT, **identity_of_study(env, config)}
+    with locked(path.with_name(f".{path.name}.lock"), f"file {path}"):
+        outcomes = _load(path, facts)
+        if any(seed not in outcomes for seed in seeds):
+            try:
+                _save(path, outcomes, facts)
+            except OSError as error:
+                raise OSError(f"file {path} cannot be written: {error}") from error
+        num_saved, saved_at = len(outcomes), time.monotonic()
+
+        def save_when_due(seconds: float = _SECONDS_BETWEEN_SAVES) -> None:
+            nonlocal num_saved, saved_at
+            if len(outcomes) == num_saved or time.monotonic() < saved_at + seconds:
+                return
+            saved_at = time.monotonic()
+            try:
+                _save(path, outcomes, facts)
+                num_saved = len(outcomes)
+            except OSError as error:
+                warnings.warn(f"file {path} could not be written ({error}); it keeps {num_saved} seeds", stacklevel=3)
+
+        try:
+            yield outcomes, save_when_due
+        finally:
+            save_when_due(seconds=0)
+
+
 def _save(path: Path, outcomes: dict[int, Outcome], facts: dict[str, Any]) -> None:
     ordered = [outcomes[seed] for seed in sorted(outcomes)]
     columns = {f"{o.seed}/{name}": getattr(o, name) for o in ordered for name in ("rewards", "steps")}
     seeds = [(o.seed, o.solved_at, o.digest.hex()) for o in ordered]
-    path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         temporary.write_bytes(to_bytes(columns, {**facts, "seeds": seeds}))
 

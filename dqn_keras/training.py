@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 import math
 import os
 import time
@@ -15,13 +14,13 @@ from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import Agent, keeps_averages, make_agent, optimizer_shown, owners_optimizer
-from dqn_keras.callbacks import with_callbacks
+from dqn_keras.callbacks import Listeners
 from dqn_keras.checks.environments import CheckedEnv, Spaces, check_environment, some_states
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.checks.numbers import check_count
 from dqn_keras.checks.run import check_arguments, check_callbacks, check_own_parts
 from dqn_keras.config import Config
-from dqn_keras.interruption import stop_requests
+from dqn_keras.interruption import TrainingInterrupted, stop_requests
 from dqn_keras.learn import td_targets
 from dqn_keras.loops import compiled, gymnasium
 from dqn_keras.metrics import Episode, history
@@ -99,7 +98,7 @@ def train(
     optimizer: keras.Optimizer | None = None,
     targets: Callable = td_targets,
     loss: str | Callable | None = None,
-    callbacks: keras.callbacks.Callback | Sequence[keras.callbacks.Callback] = (),
+    callbacks: keras.callbacks.Callback | Sequence[keras.callbacks.Callback] | None = (),
     checkpoint: str | os.PathLike | None = None,
     checkpoint_every: int = 100,
     resume: bool = False,
@@ -129,7 +128,8 @@ def train(
         loss: any loss that Keras takes in `compile`: a name, a `keras.losses.Loss`, or a function of (y, q), both [B].
             The function returns a scalar, or [B], which is averaged. The default is the loss that you compiled
             `q_network` with, or else "mse".
-        callbacks: Keras callbacks. An episode is an epoch of one batch, with the logs that `run.history` holds.
+        callbacks: Keras callbacks, called as by `fit`. An episode is an epoch of one batch, with the logs that
+            `run.history` holds.
             Callbacks see the network after each episode, may change it, and may set `model.stop_training`. Therefore
             compiled episodes are played one at a time, unless all callbacks are plain keras.callbacks.CSVLogger.
         checkpoint: a folder for the checkpoints of this run, each with its whole state; None saves none. If one cannot
@@ -144,10 +144,10 @@ def train(
             classes need a name that can be imported; they count as the same if they compute the same.
         verbose: 1 prints a line every 100 episodes and one when solved; 2 also shows a progress bar; 0 prints nothing.
 
-    Ctrl-C, an interrupted notebook cell and SIGTERM end the run at the end of an episode. The run is saved if there is
-    a checkpoint folder, and `train` returns it, marked `interrupted`. A second signal raises KeyboardInterrupt.
-
     Raises:
+        TrainingInterrupted: Ctrl-C, an interrupted notebook cell or SIGTERM came. The episode is finished, and the run
+            is saved if there is a checkpoint folder; the exception's `run` has it. A second signal raises
+            KeyboardInterrupt at once.
         TypeError, ValueError: an argument or a space is not supported; the network does not fit the environment; the
             environment returned a NaN, an infinity or a wrong shape (the message names episode and step); learning
             diverged.
@@ -164,27 +164,26 @@ def train(
     agent = make_agent(*sizes, config, seed_in_use, q_network, optimizer, formulas.loss, some, spaces.state_dtype)
     checkpoints = None
     if checkpoint is not None:
-        in_use = optimizer or owners_optimizer(q_network)
-        saved_as = identity(env, config, agent, formulas, q_network, in_use)
+        saved_as = identity(env, config, agent, formulas, q_network, optimizer or owners_optimizer(q_network))
         checkpoints = Checkpoints(checkpoint, saved_as, checkpoint_every)
-        resumed_from = checkpoints.begin(agent, seed, resume)
-        if verbose and resume:
-            print(f"Resumed at episode {len(agent.episodes)} from {resumed_from}" if resumed_from else "A new run")
-    run = Run(config, agent, steps_per_second=[math.nan] * len(agent.episodes))
-
-    episodes_per_call = 100 if checkpoints is None else min(100, checkpoint_every)
-    played = _timed(_episodes(env, spaces, run, formulas, callbacks, episodes_per_call), run)
-    finish = _finisher(run, checkpoints)
-    if callbacks:
-        played = with_callbacks(played, run, callbacks, before_end=finish)
-    with Progress(run, verbose) as progress, stop_requests() as is_asked_to_stop, optimizer_shown(agent):
-        _play_until_over(run, played, progress, checkpoints, is_asked_to_stop)
-        finish()
-        if checkpoints and not run.diverged and not keeps_averages(agent.optimizer):
-            checkpoints.save_the_end(agent, has_callbacks=bool(callbacks))
-        run.interrupted = is_asked_to_stop()
-    progress.show_end(checkpoints.folder if checkpoints else None)
-    if not (agent.num_updates or run.interrupted or run.diverged):
+    with checkpoints.alone() if checkpoints else contextlib.nullcontext():
+        if checkpoints:
+            resumed_from = checkpoints.begin(agent, seed, resume)
+            if verbose and resume:
+                print(f"Resumed at episode {len(agent.episodes)} from {resumed_from}" if resumed_from else "A new run")
+        run = Run(config, agent, steps_per_second=[math.nan] * len(agent.episodes))
+        episodes_per_call = min(100, checkpoint_every) if checkpoints else 100
+        played = _timed(_episodes(env, spaces, run, formulas, callbacks, episodes_per_call), run)
+        listeners = Listeners(run, callbacks)
+        with Progress(run, verbose) as progress, stop_requests() as is_asked_to_stop, optimizer_shown(agent):
+            listeners.begin()
+            heard = listeners.heard(played) if callbacks else played
+            _play_until_over(run, heard, progress, checkpoints, is_asked_to_stop)
+            _finish(run, listeners, checkpoints)
+    progress.show_end()
+    if is_asked_to_stop():
+        raise TrainingInterrupted(run, checkpoints.folder if checkpoints else None)
+    if not (agent.num_updates or run.diverged):
         warnings.warn(
             f"train ended without an update: the memory holds {len(agent.memory)} transitions, "
             f"batch_size is {config.batch_size}",
@@ -209,24 +208,6 @@ def _episodes(
     return compiled.episodes(env, spaces, run.agent, run.config, episodes_per_call if only_logs else 1, formulas)
 
 
-def _finisher(run: Run, checkpoints: Checkpoints | None) -> Callable[[], None]:
-    """Returns a function that replaces the weights by their averages, as `fit` does, if the optimizer keeps averages.
-
-    Before that, a checkpoint saves the weights themselves, because a resumed run continues from them. A second call
-    does nothing.
-    """
-
-    @functools.cache
-    def finish() -> None:
-        optimizer = run.agent.optimizer
-        if checkpoints and not run.diverged and keeps_averages(optimizer):
-            checkpoints.save_the_end(run.agent, has_callbacks=False)
-        if run.agent.num_updates:
-            optimizer.finalize_variable_values(run.q_network.trainable_variables)
-
-    return finish
-
-
 def _play_until_over(
     run: Run,
     played: Generator[Episode, None, None],
@@ -244,8 +225,30 @@ def _play_until_over(
                 continue  # compiled episodes: the agent is ahead of this one
             if checkpoints:
                 checkpoints.save_when_due(run.agent)
-            if run.solved_at is not None or is_asked_to_stop():
+            if run.solved_at is not None:
                 return
+            if is_asked_to_stop():
+                run.interrupted = len(run.episodes) < run.config.num_episodes
+                return
+
+
+def _finish(run: Run, listeners: Listeners, checkpoints: Checkpoints | None) -> None:
+    """Ends a run as `fit` does: weight averages replace the weights, then the callbacks' `on_train_end` is called.
+
+    An interrupted run ends as `fit` does after an exception, without either. A checkpoint saves the weights themselves,
+    because a resumed run continues from them.
+    """
+    agent, keeper = run.agent, None if run.diverged else checkpoints
+    averages = keeps_averages(agent.optimizer)
+    if keeper and (run.interrupted or averages):
+        keeper.save_the_end(agent)
+    if run.interrupted:
+        return
+    if agent.num_updates:
+        agent.optimizer.finalize_variable_values(agent.q_network.trainable_variables)
+    listeners.end()
+    if keeper and not averages:
+        keeper.save_the_end(agent, may_have_changed=bool(listeners.callbacks))
 
 
 def _timed(episodes: Iterator[Episode], run: Run) -> Generator[Episode, None, None]:

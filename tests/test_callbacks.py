@@ -1,6 +1,8 @@
 """Keras' own callbacks in both loops: an episode is an epoch."""
 
+import contextlib
 import csv
+import functools
 
 import gymnasium as gym
 import keras
@@ -120,16 +122,102 @@ def test_terminate_on_nan_does_not_mind_the_episodes_before_the_first_update(env
     assert len(run.rewards) == 30
 
 
-@pytest.mark.slow
-def test_lambda_callbacks_hear_everything_in_keras_order(env):
-    tape = []
-    events = ("train_begin", "epoch_begin", "train_batch_begin", "train_batch_end", "epoch_end", "train_end")
-    listeners = {
-        f"on_{event}": lambda *arguments, event=event: tape.append((event, *arguments[:-1])) for event in events
-    }
-    play(env, keras.callbacks.LambdaCallback(**listeners), config=Config(num_episodes=2, batch_size=2))
-    episode = [[("epoch_begin", k), ("train_batch_begin", 0), ("train_batch_end", 0), ("epoch_end", k)] for k in (0, 1)]
-    assert tape == [("train_begin",), *episode[0], *episode[1], ("train_end",)]
+class Recorder(keras.callbacks.Callback):
+    """Records each call: its name, its number if it has one, and whether the logs hold a loss."""
+
+    def __init__(self, do=lambda event, model: None):
+        super().__init__()
+        self.calls, self.do = [], do
+        for name in dir(keras.callbacks.Callback):
+            if name.startswith("on_"):
+                setattr(self, name, functools.partial(self._record, name))
+
+    def _record(self, name, *arguments, logs=None):
+        if not arguments or isinstance(arguments[-1], dict):
+            logs = arguments[-1] if arguments else logs
+            arguments = arguments[:-1]
+        self.calls.append((name, *arguments, "loss" in (logs or {})))
+        self.do(self.calls[-1][:-1], self.model)
+
+    def set_params(self, params):
+        super().set_params(params)
+        self.calls.append(("set_params", params))
+
+
+class PlannedError(Exception):
+    pass
+
+
+def at(event, do):
+    return lambda call, model: do(model) if call == event else None
+
+
+def stop(model):
+    model.stop_training = True
+
+
+def fail(model):
+    raise PlannedError
+
+
+ENDS = {
+    "a normal end": lambda call, model: None,
+    "stop after an epoch": at(("on_epoch_end", 1), stop),
+    "stop after a batch": at(("on_train_batch_end", 0), stop),
+    "stop before the first epoch": at(("on_train_begin",), stop),
+    "a fault between epochs": at(("on_epoch_begin", 1), fail),
+    "a fault in an epoch": at(("on_train_batch_begin", 0), fail),
+}
+
+
+@pytest.mark.parametrize("do", ENDS.values(), ids=ENDS.keys())
+def test_callbacks_are_called_as_by_fit(env, do):
+    recorders = Recorder(do), Recorder(do)
+    model = keras.Sequential([keras.Input((1,)), keras.layers.Dense(1)])
+    model.compile(loss="mse")
+    with contextlib.suppress(PlannedError):
+        model.fit(np.ones((4, 1)), np.ones((4, 1)), batch_size=4, epochs=3, verbose=0, callbacks=[recorders[0]])
+    with contextlib.suppress(PlannedError):
+        play(env, recorders[1], config=Config(num_episodes=3, batch_size=2))
+    assert recorders[1].calls == recorders[0].calls
+
+
+def test_callbacks_are_called_as_by_fit_when_a_step_fails(env):
+    def break_network(model):
+        model.layers[0].kernel.assign(np.full(model.layers[0].kernel.shape, np.nan))
+
+    model = keras.Sequential([keras.Input((1,)), keras.layers.Dense(1)])
+    model.compile(loss="mse")
+    recorders = Recorder(at(("on_epoch_begin", 1), break_network)), Recorder(at(("on_epoch_begin", 1), break_network))
+    nan = [keras.callbacks.TerminateOnNaN() for _ in range(2)]
+    model.fit(np.ones((4, 1)), np.ones((4, 1)), batch_size=4, epochs=3, verbose=0, callbacks=[recorders[0], nan[0]])
+    run = play(env, recorders[1], nan[1], config=Config(num_episodes=3, batch_size=2))
+    assert run.diverged
+    assert recorders[1].calls == recorders[0].calls
+
+
+def test_a_backup_survives_an_error_and_restores_the_weights(env, tmp_path):
+    class Failing(keras.callbacks.Callback):
+        def on_epoch_begin(self, epoch, logs=None):
+            if epoch == 20:
+                self.weights = self.model.get_weights()
+                raise PlannedError
+
+    class Restored(keras.callbacks.Callback):
+        def on_train_begin(self, logs=None):
+            self.weights = self.model.get_weights()
+
+    failing, restored = Failing(), Restored()
+    with pytest.raises(PlannedError):
+        play(env, keras.callbacks.BackupAndRestore(tmp_path / "backup"), failing)
+    play(env, keras.callbacks.BackupAndRestore(tmp_path / "backup"), restored)
+    for ours, theirs in zip(restored.weights, failing.weights, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert not (tmp_path / "backup").exists()
+
+
+def test_no_callbacks_may_be_none(env):
+    assert len(train(env, Config(num_episodes=2, batch_size=2), seed=0, callbacks=None, verbose=0).episodes) == 2
 
 
 class Meddler(keras.callbacks.Callback):

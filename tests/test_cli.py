@@ -292,7 +292,7 @@ def test_a_folder_is_for_one_process_at_a_time(capfd):
     dqn_keras(f"train CartPole-v1 --seed 3 --out a {SHORT}")
     with filelock.FileLock("a/.lock"):
         assert dqn_keras("resume a") == 2
-    assert capfd.readouterr().err == "dqn-keras: a is in use: another process trains there\n"
+    assert capfd.readouterr().err == "dqn-keras: a is in use: another process or thread writes there\n"
     assert dqn_keras("resume a --quiet") == 0
 
 

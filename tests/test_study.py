@@ -1,4 +1,5 @@
 import dataclasses
+import errno
 import hashlib
 import importlib
 import os
@@ -18,6 +19,7 @@ from dqn_keras import Config, Study, compare, episode_seed, load_study, plot_stu
 from dqn_keras.environments import CartPole
 from dqn_keras.study import Outcome
 from tests.helpers.environments import Corridor
+from tests.helpers.faults import failing
 
 module = importlib.import_module("dqn_keras.study")  # `dqn_keras.study` is the function
 QUICK = Config(num_episodes=30, batch_size=16, solved_reward=1000)
@@ -120,6 +122,42 @@ def test_the_same_study_again_does_only_what_is_missing(tmp_path, trained):
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(ValueError, match=r"quick\.npz is not a study that can be loaded: its SHA-256"):
         load_study(file)
+
+
+def test_a_second_study_is_refused_while_one_writes_the_file(tmp_path, trained):
+    refused = []
+
+    def try_to_join(outcomes):
+        for outcome in outcomes:
+            with pytest.raises(ValueError, match=r"^file .*study\.npz is in use: another process or thread"):
+                study(CartPole(), QUICK, [7], file=tmp_path / "study.npz", num_workers=1, verbose=0)
+            refused.append(outcome.seed)
+            yield outcome
+
+    engines = {"joblib": lambda *arguments: try_to_join(module._by_joblib(*arguments))}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_ENGINES", engines)
+        study(CartPole(), QUICK, range(2), file=tmp_path / "study.npz", num_workers=1, verbose=0)
+    assert refused == trained == [0, 1]
+    assert len(study(CartPole(), QUICK, [7], file=tmp_path / "study.npz", num_workers=1, verbose=0).outcomes) == 1
+
+
+def test_a_file_that_cannot_be_written_is_an_error_before_any_work(tmp_path, trained):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"^file .*study\.npz cannot be written: "):
+        study(CartPole(), QUICK, range(2), file=tmp_path / "file" / "study.npz", num_workers=1, verbose=0)
+    assert trained == []
+
+
+def test_a_file_that_cannot_be_written_at_the_end_loses_nothing_but_the_file(tmp_path, trained):
+    full = OSError(errno.ENOSPC, "No space left on device")
+    with (
+        failing(os, "fsync", full, after=2),  # a save flushes a file and a folder
+        pytest.warns(UserWarning, match=r"^file .*study\.npz could not be written \(.*No space left.*keeps 0 seeds"),
+    ):
+        kept = study(CartPole(), QUICK, range(2), file=tmp_path / "study.npz", num_workers=1, verbose=0)
+    same(kept, study(CartPole(), QUICK, range(2), file=tmp_path / "study.npz", num_workers=1, verbose=0))
+    assert trained == [0, 1, 0, 1]
 
 
 def test_an_interrupted_run_in_this_process_ends_the_study_with_what_is_finished(tmp_path, monkeypatch, trained):

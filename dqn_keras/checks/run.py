@@ -28,10 +28,10 @@ def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> Non
 
 
 def check_callbacks(
-    callbacks: keras.callbacks.Callback | Sequence[keras.callbacks.Callback],
+    callbacks: keras.callbacks.Callback | Sequence[keras.callbacks.Callback] | None,
 ) -> list[keras.callbacks.Callback]:
     """Returns one or several callbacks as a list; raises TypeError if one is not a Keras callback."""
-    callbacks = [callbacks] if isinstance(callbacks, keras.callbacks.Callback) else list(callbacks)
+    callbacks = [callbacks] if isinstance(callbacks, keras.callbacks.Callback) else list(callbacks or ())
     for callback in callbacks:
         if not isinstance(callback, keras.callbacks.Callback):
             raise TypeError(f"callbacks must be Keras callbacks, got {callback!r}")

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import filelock
 import gymnasium as gym
 import matplotlib.pyplot as plt
 
@@ -19,9 +18,10 @@ from dqn_keras import environments
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.checks.environments import check_environment
 from dqn_keras.config import Config
+from dqn_keras.interruption import TrainingInterrupted
 from dqn_keras.metrics import LOGGED
 from dqn_keras.plotting import plot_history, plot_study
-from dqn_keras.storage.files import replacing
+from dqn_keras.storage.files import locked, replacing
 from dqn_keras.storage.networks import load_q_network
 from dqn_keras.storage.versions import versions
 from dqn_keras.study import load_study
@@ -145,15 +145,16 @@ def read_q_network(folder: Path) -> keras.Model:
 
 def begin(folder: Path, settings: Settings, verbose: int) -> Run:
     """Starts a run in a folder that holds none yet."""
-    if (folder / "config.json").exists():
-        raise ValueError(
-            f"{folder} already holds a run: `dqn-keras resume {folder}` continues it, another --out starts a new one"
-        )
     env = settings.env.make_for_training()
     check_environment(env)  # before the folder is made
-    folder.mkdir(parents=True, exist_ok=True)
-    write_settings(folder, settings)
-    return _train(folder, env, settings, verbose, resume=False)
+    with _alone_in(folder):
+        if (folder / "config.json").exists():
+            raise ValueError(
+                f"{folder} already holds a run: `dqn-keras resume {folder}` continues it, "
+                "another --out starts a new one"
+            )
+        write_settings(folder, settings)
+        return _train(folder, env, settings, verbose, resume=False)
 
 
 def resume(folder: Path, num_episodes: int | None, verbose: int, imported: str | None = None) -> Run:
@@ -163,27 +164,28 @@ def resume(folder: Path, num_episodes: int | None, verbose: int, imported: str |
         config = dataclasses.replace(settings.config, num_episodes=num_episodes)
         settings = dataclasses.replace(settings, config=config)
     env = settings.env.make_for_training()
-    write_settings(folder, settings)
-    try:
-        return _train(folder, env, settings, verbose, resume=True)
-    except ValueError:
-        write_settings(folder, before)
-        raise
+    with _alone_in(folder):
+        write_settings(folder, settings)
+        try:
+            return _train(folder, env, settings, verbose, resume=True)
+        except ValueError:
+            write_settings(folder, before)
+            raise
+
+
+def _alone_in(folder: Path) -> contextlib.AbstractContextManager[None]:
+    return locked(folder / ".lock", str(folder))
 
 
 def _train(folder: Path, env: Any, settings: Settings, verbose: int, resume: bool) -> Run:
     log = folder / "log.csv"
+    if log.exists():  # a kill may have cut off its last line
+        content = log.read_bytes()
+        log.write_bytes(content[: content.rfind(b"\n") + 1])
+    callbacks = [keras.callbacks.CSVLogger(log, append=True)]
+    if settings.tensorboard:
+        callbacks.append(keras.callbacks.TensorBoard(folder / "tensorboard"))
     try:
-        lock = filelock.FileLock(folder / ".lock", timeout=0).acquire()
-    except filelock.Timeout:
-        raise ValueError(f"{folder} is in use: another process trains there") from None
-    with lock:
-        if log.exists():  # a kill may have cut off its last line
-            content = log.read_bytes()
-            log.write_bytes(content[: content.rfind(b"\n") + 1])
-        callbacks = [keras.callbacks.CSVLogger(log, append=True)]
-        if settings.tensorboard:
-            callbacks.append(keras.callbacks.TensorBoard(folder / "tensorboard"))
         run = train(
             env,
             settings.config,
@@ -193,9 +195,11 @@ def _train(folder: Path, env: Any, settings: Settings, verbose: int, resume: boo
             resume=resume,
             verbose=verbose,
         )
-        _write_log(log, run.history)
-        run.save(folder / "agent.keras")
-        draw(folder)
+    except TrainingInterrupted as interrupted:
+        run = interrupted.run
+    _write_log(log, run.history)
+    run.save(folder / "agent.keras")
+    draw(folder)
     return run
 
 

@@ -7,7 +7,7 @@ written under another name, flushed to the disk and only then renamed, so that a
 import contextlib
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from dqn_keras.agent import Agent
 from dqn_keras.learn import Metrics
 from dqn_keras.metrics import Episode
 from dqn_keras.replay import unpack
-from dqn_keras.storage.files import FORMAT, DamagedError, from_bytes, replacing, to_bytes
+from dqn_keras.storage.files import FORMAT, DamagedError, from_bytes, locked, replacing, to_bytes
 from dqn_keras.storage.identity import MAY_CHANGE_ON_RESUME, Identity, check_is_same
 from dqn_keras.storage.versions import warn_of_other_versions
 
@@ -33,9 +33,18 @@ class Checkpoints:
         every: int = 100,
     ) -> None:
         self.folder = Path(folder)
-        self._every, self._saved_at = every, 0
+        self._every, self._saved_at, self._is_failing = every, 0, False
         self._identity, self._other_variables = identity
-        self._kept: list[Path] = []  # newest first; the first is whole
+        self._kept: list[Path] = []  # files of this run, newest first; the first is whole
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keeps other runs out of the folder while the block runs."""
+        with locked(self.folder / ".lock", f"checkpoint {self.folder}"):
+            for unfinished in self.folder.glob(".checkpoint-*.partial.npz"):  # of processes that have died
+                with contextlib.suppress(OSError):
+                    unfinished.unlink()
+            yield
 
     def paths(self) -> list[Path]:
         """Returns the checkpoint files, newest first."""
@@ -50,7 +59,10 @@ class Checkpoints:
             )
         path = self.restore(agent, seed) if resume else None
         if path is None:
-            self.save(agent)
+            try:
+                self.save(agent)
+            except OSError as error:
+                raise OSError(f"checkpoint {self.folder} cannot be written: {error}") from error
         self._saved_at = len(agent.episodes)
         return path
 
@@ -59,20 +71,25 @@ class Checkpoints:
         if len(agent.episodes) >= self._saved_at + self._every:
             self._save_or_warn(agent)
 
-    def save_the_end(self, agent: Agent, has_callbacks: bool) -> None:
-        """Saves if anything may be new since the last time: callbacks may change the agent in `on_train_end`."""
-        if has_callbacks or len(agent.episodes) > self._saved_at:
+    def save_the_end(self, agent: Agent, may_have_changed: bool = False) -> None:
+        """Saves if episodes have passed since the last time, or if callbacks may have changed the agent."""
+        if may_have_changed or len(agent.episodes) > self._saved_at:
             self._save_or_warn(agent)
 
     def _save_or_warn(self, agent: Agent) -> None:
+        """Saves; if that fails, warns once until it succeeds again."""
         self._saved_at = len(agent.episodes)
         try:
             self.save(agent)
+            self._is_failing = False
         except OSError as error:
-            warnings.warn(
-                f"checkpoint after episode {len(agent.episodes) - 1} could not be saved ({error}); the last one stays",
-                stacklevel=4,
-            )
+            if not self._is_failing:
+                warnings.warn(
+                    f"checkpoint after episode {len(agent.episodes) - 1} could not be saved ({error}); "
+                    f"the last one stays, and the run tries again every {self._every} episodes",
+                    stacklevel=4,
+                )
+            self._is_failing = True
 
     def save(self, agent: Agent) -> None:
         """Saves the state of `agent` at the end of an episode; raises OSError if the disk cannot be written."""
@@ -83,10 +100,14 @@ class Checkpoints:
         self.folder.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary:
             temporary.write_bytes(content)
-        self._kept = [path, *(older for older in self._kept if older != path)][:2]
-        for other in {*self.paths(), *self.folder.glob(".*.partial.npz")} - set(self._kept):
+        self._kept = [path, *(older for older in self._kept if older != path)]
+        self._delete_all_but_two()
+
+    def _delete_all_but_two(self) -> None:
+        for older in self._kept[2:]:
             with contextlib.suppress(OSError):
-                other.unlink()
+                older.unlink()
+        del self._kept[2:]
 
     def restore(self, agent: Agent, seed: int | None) -> Path | None:
         """Puts `agent` into the newest whole state and returns its file; None if there is no file yet.
@@ -113,11 +134,22 @@ class Checkpoints:
             if damaged:
                 warnings.warn(f"{'; '.join(damaged)}. The run continues from the older {path}", stacklevel=4)
             warn_of_other_versions(path, facts, self._identity, stacklevel=5)
-            self._kept = [other for other in self.paths() if other <= path][:2]  # the newer ones are damaged
+            older = [x for x in self.paths() if x < path and self._is_of_this_run(x, facts)]
+            self._kept = [path, *older]
+            self._delete_all_but_two()
             return path
         if damaged:
             raise ValueError(f"checkpoint: {'; '.join(damaged)}")
         return None
+
+    def _is_of_this_run(self, path: Path, facts: dict[str, Any]) -> bool:
+        """Returns whether an older file is an earlier state of the run with these facts, so that it may be deleted."""
+        try:
+            _, theirs = from_bytes(path.read_bytes())
+            check_is_same(path, theirs, {**self._identity, "seed": facts["seed"]}, MAY_CHANGE_ON_RESUME)
+        except (ValueError, KeyError, OSError):
+            return False
+        return True
 
 
 def _arrays(agent: Agent, others: Sequence[tf.Variable]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import filelock
 import numpy as np
 
 from dqn_keras.version import __version__
@@ -79,3 +80,24 @@ def replacing(path: Path) -> Iterator[Path]:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+@contextlib.contextmanager
+def locked(path: Path, what: str) -> Iterator[None]:
+    """Makes a lock file, and its folder, and holds it while the block runs.
+
+    The system releases the lock of a process that dies. Where no file can be made, there is no lock, and nothing to
+    protect.
+
+    Raises:
+        ValueError: somebody else holds the lock; the message begins with `what`.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock: contextlib.AbstractContextManager = filelock.FileLock(path, timeout=0).acquire()
+    except filelock.Timeout:
+        raise ValueError(f"{what} is in use: another process or thread writes there") from None
+    except OSError:
+        lock = contextlib.nullcontext()
+    with lock:
+        yield

@@ -1,6 +1,7 @@
 """Faults done to training on purpose, by tests at a small size and by `benchmarks.reliability` at the full one."""
 
 import contextlib
+import dataclasses
 import hashlib
 import multiprocessing
 import os
@@ -13,12 +14,15 @@ import warnings
 from pathlib import Path
 
 import gymnasium as gym
+import keras
 import numpy as np
+import tensorflow as tf
 
-from dqn_keras import Config, train
+from dqn_keras import Config, TrainingInterrupted, train
 from dqn_keras.agent import make_agent
 from dqn_keras.environments import CartPole
-from dqn_keras.storage import checkpoint, files
+from dqn_keras.storage import checkpoint
+from dqn_keras.storage import files as storage_files
 from dqn_keras.storage.checkpoint import Checkpoints
 from dqn_keras.storage.files import from_bytes, to_bytes
 from dqn_keras.storage.identity import identity
@@ -28,14 +32,76 @@ CONFIG = Config(num_episodes=250, batch_size=32, memory_size=2_000, solved_rewar
 SEED, EVERY = 3, 5
 
 
-def play(loop, folder, config=CONFIG, seed=SEED, env=None, resume=True, **arguments):
-    """A run of the campaign, or what is left of it."""
-    env = env or LOOPS[loop]()
+def half_targets(experiences, gamma, q_network, q_hat_network):
+    """Targets of the user's own: a mean of Q and Q-hat."""
+    values = (q_network(experiences.next_state) + q_hat_network(experiences.next_state)) / 2
+    return experiences.reward + (1 - experiences.terminal_state) * gamma * tf.reduce_max(values, axis=-1)
+
+
+class RunningScale(keras.losses.Loss):
+    """A loss of the user's own, with a variable that is part of the run's state."""
+
+    def __init__(self):
+        super().__init__()
+        self.scale = tf.Variable(1.0)
+
+    def call(self, y, q):
+        self.scale.assign(0.99 * self.scale + 0.01 * tf.reduce_mean(tf.abs(y - q)))
+        return tf.square(y - q) / self.scale
+
+
+def _own_network(*layers):
+    keras.utils.set_random_seed(0)
+    return keras.Sequential([keras.Input((4,)), *layers, keras.layers.Dense(2)])
+
+
+def _convolution():
+    layers = keras.layers
+    return _own_network(layers.Reshape((2, 2, 1)), layers.Conv2D(3, 2, activation="relu"), layers.Flatten())
+
+
+def _lstm():
+    return _own_network(keras.layers.Reshape((4, 1)), keras.layers.LSTM(5))
+
+
+def _normalized():
+    return _own_network(keras.layers.Dense(16, "relu"), keras.layers.BatchNormalization())
+
+
+def _scheduled():
+    return keras.optimizers.Adam(keras.optimizers.schedules.ExponentialDecay(0.003, 100, 0.9), clipnorm=1.0)
+
+
+OWN_PARTS = {  # a case is the name of its loop and what it is
+    ("Gymnasium loop", "convolution, schedule"): lambda: {"q_network": _convolution(), "optimizer": _scheduled()},
+    ("compiled episodes", "convolution, own loss"): lambda: {"q_network": _convolution(), "loss": RunningScale()},
+    ("Gymnasium loop", "LSTM, own targets"): lambda: {"q_network": _lstm(), "targets": half_targets},
+    ("compiled episodes", "LSTM, schedule"): lambda: {"q_network": _lstm(), "optimizer": _scheduled()},
+    ("Gymnasium loop", "BatchNormalization, own loss"): lambda: {"q_network": _normalized(), "loss": RunningScale()},
+    ("compiled episodes", "BatchNormalization, own targets"): lambda: {
+        "q_network": _normalized(),
+        "targets": half_targets,
+    },
+}
+
+
+def play(case, folder, config=CONFIG, seed=SEED, env=None, resume=True, **arguments):
+    """A run of the campaign, or what is left of it; a case is the name of a loop, or one of OWN_PARTS."""
+    if case in OWN_PARTS:
+        config, arguments = dataclasses.replace(config, num_episodes=100), OWN_PARTS[case]()
+        case = case[0]
+        warnings.filterwarnings("ignore", "q_network is called in inference mode")
+    env = env or LOOPS[case]()
     return train(env, config, seed, checkpoint=folder, checkpoint_every=EVERY, resume=resume, verbose=0, **arguments)
 
 
 def newest(folder):
     return max(Path(folder).glob("checkpoint-*.npz"))
+
+
+def files(folder):
+    """The names of the files of a run, without the lock, which stays."""
+    return sorted({path.name for path in Path(folder).iterdir()} - {".lock"})
 
 
 def final_bits(folder):
@@ -46,11 +112,11 @@ def final_bits(folder):
 # Kills. A child process trains; it dies by SIGKILL, from outside at a random time or by its own hand inside a save.
 
 
-def _train_in_child(loop, folder, started, death):
+def _train_in_child(case, folder, started, death):
     started.set()
     if death is not None:
         _die_in_save(*death)
-    play(loop, folder)
+    play(case, folder)
 
 
 def _die_in_save(num_saves, num_lines, share):
@@ -59,7 +125,7 @@ def _die_in_save(num_saves, num_lines, share):
 
     def tracer(frame, event, _):
         nonlocal num_lines
-        if frame.f_code.co_filename not in (checkpoint.__file__, files.__file__):
+        if frame.f_code.co_filename not in (checkpoint.__file__, storage_files.__file__):
             return None
         if event == "line":
             num_lines -= 1
@@ -97,24 +163,24 @@ def child_process(target, *arguments):
     return process
 
 
-def kill_campaign(folder, num_kills, num_in_saves, kills_per_run=10, seed=0):
-    """SIGKILL runs of both loops again and again, each time resumed: -> kills done, in saves, runs, differing runs.
+def kill_campaign(folder, num_kills, num_in_saves, kills_per_run=10, seed=0, cases=tuple(LOOPS)):
+    """SIGKILL runs of these cases again and again, each time resumed: -> kills done, in saves, runs, differing runs.
 
     `num_in_saves` of the deaths, or a few more, are inside a save. After each the newest checkpoint must be whole.
     """
     rng, folder = random.Random(seed), Path(folder)
-    references, seconds = {}, {}
-    for loop in LOOPS:
-        process = child_process(_train_in_child, loop, folder / f"reference {loop}", None)
+    references, seconds, references_folder = {}, {}, folder / "references"
+    for case in cases:
+        process = child_process(_train_in_child, case, references_folder / str(cases.index(case)), None)
         start = time.perf_counter()
         process.join()
         assert process.exitcode == 0
-        seconds[loop] = time.perf_counter() - start
-        references[loop] = final_bits(folder / f"reference {loop}")
+        seconds[case] = time.perf_counter() - start
+        references[case] = final_bits(references_folder / str(cases.index(case)))
 
     killed = killed_in_saves = runs = differing = attempts = 0
     while killed < num_kills:
-        loop = list(LOOPS)[runs % 2]
+        case = cases[runs % len(cases)]
         run_folder = folder / f"run {runs}"
         for _ in range(min(kills_per_run, num_kills - killed)):
             attempts += 1
@@ -123,9 +189,9 @@ def kill_campaign(folder, num_kills, num_in_saves, kills_per_run=10, seed=0):
             death = None
             if is_in_save:
                 death = (rng.randrange(1, 8), rng.randrange(60), rng.choice([None, rng.random()]))
-            process = child_process(_train_in_child, loop, run_folder, death)
+            process = child_process(_train_in_child, case, run_folder, death)
             if not is_in_save:
-                process.join(rng.uniform(0, seconds[loop]))
+                process.join(rng.uniform(0, seconds[case]))
                 process.kill()
             process.join()
             if process.exitcode == 0:
@@ -134,12 +200,12 @@ def kill_campaign(folder, num_kills, num_in_saves, kills_per_run=10, seed=0):
             killed, killed_in_saves = killed + 1, killed_in_saves + is_in_save
             if list(run_folder.glob("checkpoint-*.npz")):
                 from_bytes(newest(run_folder).read_bytes())
-        process = child_process(_train_in_child, loop, run_folder, None)
+        process = child_process(_train_in_child, case, run_folder, None)
         process.join()
         assert process.exitcode == 0
-        left = sorted(path.name for path in run_folder.iterdir())
+        left = files(run_folder)
         is_tidy = len(left) == 2 and not any("partial" in name for name in left)
-        differing += final_bits(run_folder) != references[loop] or not is_tidy
+        differing += final_bits(run_folder) != references[case] or not is_tidy
         runs += 1
         shutil.rmtree(run_folder)
     return {"kills": killed, "of them inside a save": killed_in_saves, "runs": runs, "differing runs": differing}
@@ -295,8 +361,20 @@ def failing(module, name, error, after=0):
 
 def _train_and_report(loop, folder, started, report):
     started.set()
-    run = play(loop, folder)
-    Path(report).write_text("interrupted" if run.interrupted else "ended")
+    try:
+        play(loop, folder)
+    except TrainingInterrupted as stop:
+        Path(report).write_text("interrupted" if stop.run.interrupted else "ended")
+
+
+def try_to_train(loop, folder, started, report):
+    started.set()
+    try:
+        play(loop, folder)
+    except ValueError as error:
+        Path(report).write_text(str(error))
+    else:
+        Path(report).write_text("trained")
 
 
 def _after_first_checkpoint(folder):
