@@ -19,6 +19,7 @@ README = (ROOT / "README.md").read_text()
 @pytest.mark.usefixtures("script_folder")
 def test_the_readmes_scripts_run(script):
     exec(compile(script, "README.md", "exec"), {})
+    assert ("plot" in script) == bool(list(Path.cwd().glob("*.png"))), "a script shows its picture, or saves it"
 
 
 def test_the_readmes_commands_are_ones():

@@ -74,6 +74,23 @@ def test_processes_that_fill_the_cache_at_once_do_each_other_no_harm(tmp_path):
     assert len({name.rpartition(".")[0] for name in before}) == len(before)
 
 
+KERAS_FIRST = """
+import sys
+import keras
+import gymnasium as gym
+from dqn_keras import Config, train
+print("Imported", file=sys.stderr)
+run = train(gym.make("CartPole-v1"), Config(num_episodes=20), seed=0)
+"""
+
+
+def test_tensorflow_logs_nothing_between_the_lines_of_train_even_if_keras_was_imported_first():
+    process = start(KERAS_FIRST, DQN_KERAS_CACHE="0")
+    out, err = process.communicate()
+    assert out == "Episode 0, Reward: 19.0, Last 100 Average: 19.0\n"
+    assert err.endswith("Imported\n")
+
+
 FLAGS = """
 import gc, os
 gc.disable() if {is_off} else None

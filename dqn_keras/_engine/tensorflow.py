@@ -85,9 +85,14 @@ __all__ = ["keras", "require_xla", "tf"]
 
 @functools.cache
 def require_xla() -> None:
-    """Raises RuntimeError, with the remedy, if TensorFlow has no XLA compiler for this machine."""
+    """Raises RuntimeError, with the remedy, if TensorFlow has no XLA compiler for this machine.
+
+    If TensorFlow was imported before this package, with all of its log, the lines that its first compilation logs are
+    discarded, so that they are not among what `train` prints.
+    """
     try:
-        _compile_something()
+        with _native_stderr_silenced():
+            _compile_something()
     except tf.errors.OpError as error:
         raise RuntimeError(
             "XLA cannot compile on this machine; Config(jit_compile=False), or learn(..., jit_compile=False), does "
@@ -96,4 +101,4 @@ def require_xla() -> None:
 
 
 def _compile_something() -> None:
-    tf.function(tf.identity, jit_compile=True)(tf.constant(0.0))
+    tf.function(tf.nn.relu, jit_compile=True)(tf.constant(0.0))  # logs all that a gradient step would
