@@ -2,12 +2,15 @@
 
 import contextlib
 import dataclasses
+import errno
 import hashlib
 import multiprocessing
 import os
 import random
+import resource
 import shutil
 import signal
+import subprocess
 import sys
 import time
 import warnings
@@ -26,6 +29,7 @@ from dqn_keras.storage import files as storage_files
 from dqn_keras.storage.checkpoint import Checkpoints
 from dqn_keras.storage.files import from_bytes, to_bytes
 from dqn_keras.storage.identity import identity
+from tests.helpers.runs import fingerprint
 
 LOOPS = {"Gymnasium loop": lambda: gym.make("CartPole-v1"), "compiled episodes": CartPole}
 CONFIG = Config(num_episodes=250, batch_size=32, memory_size=2_000, solved_reward=1e6)  # its memory goes round
@@ -51,7 +55,6 @@ class RunningScale(keras.losses.Loss):
 
 
 def _own_network(*layers):
-    keras.utils.set_random_seed(0)
     return keras.Sequential([keras.Input((4,)), *layers, keras.layers.Dense(2)])
 
 
@@ -88,6 +91,7 @@ OWN_PARTS = {  # a case is the name of its loop and what it is
 def play(case, folder, config=CONFIG, seed=SEED, env=None, resume=True, **arguments):
     """A run of the campaign, or what is left of it; a case is the name of a loop, or one of OWN_PARTS."""
     if case in OWN_PARTS:
+        keras.utils.set_random_seed(0)  # the weights that the network starts with
         config, arguments = dataclasses.replace(config, num_episodes=100), OWN_PARTS[case]()
         case = case[0]
         warnings.filterwarnings("ignore", "q_network is called in inference mode")
@@ -354,6 +358,94 @@ def failing(module, name, error, after=0):
         yield
     finally:
         setattr(module, name, original)
+
+
+def _always(module, name, error):
+    return lambda fault, folder: fault.enter_context(failing(module, name, error))
+
+
+def _limit_file_sizes(fault, folder):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, hard))
+    fault.callback(resource.setrlimit, resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def _put_folders_in_the_way(fault, folder):
+    for k in range(15, 41, 5):
+        path = folder / f"checkpoint-{k:010d}.npz"
+        path.mkdir()
+        fault.callback(path.rmdir)
+
+
+def _fill(fault, folder):
+    with contextlib.suppress(OSError), (folder / "filler").open("wb", buffering=0) as file:
+        while file.write(bytes(1_000)):
+            pass
+    fault.callback((folder / "filler").unlink)
+
+
+def _make_immutable(fault, folder):
+    subprocess.run(["chattr", "+i", folder], check=True)
+    fault.callback(subprocess.run, ["chattr", "-i", folder], check=True)
+
+
+DISK_FAULTS = {  # each is begun in a run, and undone when its stack ends
+    "no space left on the device": _always(os, "fsync", OSError(errno.ENOSPC, "No space left on device")),
+    "an input/output error": _always(Path, "write_bytes", OSError(errno.EIO, "Input/output error")),
+    "a rename that fails": _always(os, "replace", PermissionError(errno.EACCES, "Permission denied")),
+    "a limit of the file size": _limit_file_sizes,
+    "folders where the files should be": _put_folders_in_the_way,
+    "a disk that is full": _fill,
+    "a folder that is read-only": _make_immutable,
+}
+NEED_RIGHTS = {  # commands that show whether this process, and this system, can do it
+    "a disk that is full": (["mount", "-t", "tmpfs", "tmpfs"], ["umount"]),
+    "a folder that is read-only": (["chattr", "+i"], ["chattr", "-i"]),
+}
+
+
+def is_possible(name, folder):
+    """Whether this process may do this to a folder."""
+    return all(
+        shutil.which(words[0]) and subprocess.run([*words, folder], capture_output=True).returncode == 0
+        for words in NEED_RIGHTS.get(name, ())
+    )
+
+
+def under_disk_fault(name, folder):
+    """Trains in a folder whose disk fails from episode 12 on, then resumes on the mended disk.
+
+    -> both runs, the warnings of checkpoints in the first, and the files that it left.
+    """
+    config = dataclasses.replace(CONFIG, num_episodes=40)
+    with contextlib.ExitStack() as disk:
+        if name == "a disk that is full":
+            subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", folder], check=True)
+            disk.callback(subprocess.run, ["umount", folder], check=True)
+        with contextlib.ExitStack() as fault, warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            begin = keras.callbacks.LambdaCallback(
+                on_epoch_end=lambda epoch, _: DISK_FAULTS[name](fault, folder) if epoch == 11 else None
+            )
+            run = play("Gymnasium loop", folder, config, callbacks=[begin])
+            left = [x for x in files(folder) if x != "filler" and not (folder / x).is_dir()]
+        resumed = play("Gymnasium loop", folder, config)
+    return run, resumed, [str(w.message) for w in caught if str(w.message).startswith("checkpoint")], left
+
+
+def disk_campaign(folder):
+    """-> faults of the disk, those that were not one warning, files too many, runs that differ after a resume."""
+    folder, figures = Path(folder), {"faults": 0, "not one warning": 0, "litter": 0, "differing runs": 0}
+    for k, name in enumerate(DISK_FAULTS):
+        (folder / str(k)).mkdir()
+        if not is_possible(name, folder / str(k)):
+            continue
+        run, resumed, said, left = under_disk_fault(name, folder / str(k))
+        figures["faults"] += 1
+        figures["not one warning"] += len(said) != 1
+        figures["litter"] += len(left) != 2
+        figures["differing runs"] += fingerprint(resumed) != fingerprint(run)
+    return figures
 
 
 # Signals.
