@@ -16,6 +16,7 @@ from gymnasium import spaces
 from dqn_keras import Config, evaluate, make_q_network, study, train
 from dqn_keras.checks.environments import CheckedEnv, check_spaces
 from dqn_keras.checks.observations import Watch, as_float
+from dqn_keras.cli.run_folder import EnvOptions
 from dqn_keras.environments import Acrobot, CartPole, MountainCar
 from dqn_keras.rendering import record_episode
 from dqn_keras.replay import Experience, ReplayMemory
@@ -445,6 +446,23 @@ def test_the_wrapper_that_is_named_for_a_space_works(space, way):
     assert f"({way} makes one of " in str(caught.value)
     wrapped = CheckedEnv(eval(way, {"gymnasium": gym, "env": env}))
     assert wrapped.reset(0, 0).shape == wrapped.spaces.state_shape
+
+
+@pytest.mark.parametrize("name", [name for name in WAYS if name != "an empty Dict"])  # gymnasium.make refuses that one
+def test_the_command_line_flattens_what_can_be_flattened_and_says_what_cannot(name, monkeypatch):
+    monkeypatch.setitem(gym.registry, "Grid-v0", gym.envs.registration.EnvSpec("Grid-v0", entry_point=Grid))
+    space, way = WAYS[name]
+    plain, flat = (EnvOptions("Grid-v0", {"observation_space": space}, flatten, compiled=False) for flatten in (0, 1))
+    is_possible = way is not None and name not in ("MiniGrid's", "a Tuple with a Sequence")
+    if is_possible:
+        assert len(flat.make().observation_space.shape) == 1
+    else:
+        with pytest.raises(ValueError, match=r"^Grid-v0 has the observation space .*; (gymnasium\.|no wrapper)"):
+            flat.make()
+    if not isinstance(space, spaces.Box):
+        hint = "--flatten makes one axis of it$" if is_possible else r"(gymnasium\.|no wrapper)"
+        with pytest.raises(ValueError, match=rf"^Grid-v0 has the observation space .*; {hint}"):
+            plain.make()
 
 
 NO_ENVS = {
