@@ -15,9 +15,10 @@ from gymnasium.experimental.functional import FuncEnv
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import Agent, keeps_averages, make_agent, optimizer_shown, owners_optimizer
 from dqn_keras.callbacks import Listeners
-from dqn_keras.checks.environments import CheckedEnv, Spaces, check_environment, some_states
+from dqn_keras.checks.environments import CheckedEnv, Spaces, check_environment, env_name, some_states
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.checks.numbers import check_count
+from dqn_keras.checks.observations import Watch
 from dqn_keras.checks.run import check_arguments, check_callbacks, check_own_parts
 from dqn_keras.config import Config
 from dqn_keras.interruption import TrainingInterrupted, stop_requests
@@ -173,7 +174,8 @@ def train(
                 print(f"Resumed at episode {len(agent.episodes)} from {resumed_from}" if resumed_from else "A new run")
         run = Run(config, agent, steps_per_second=[math.nan] * len(agent.episodes))
         episodes_per_call = min(100, checkpoint_every) if checkpoints else 100
-        played = _timed(_episodes(env, spaces, run, formulas, callbacks, episodes_per_call), run)
+        watch = Watch(env_name(env), env.observation_space, is_default_network=q_network is None)
+        played = _timed(_episodes(env, spaces, run, formulas, callbacks, episodes_per_call, watch), run)
         listeners = Listeners(run, callbacks)
         with Progress(run, verbose) as progress, stop_requests() as is_asked_to_stop, optimizer_shown(agent):
             listeners.begin()
@@ -199,13 +201,17 @@ def _episodes(
     formulas: Formulas,
     callbacks: Sequence[keras.callbacks.Callback],
     episodes_per_call: int,
+    watch: Watch,
 ) -> Iterator[Episode]:
     """Returns the episodes of the loop that can play `env`."""
     if not isinstance(env, FuncEnv):
-        return gymnasium.episodes(CheckedEnv(env), run.agent, run.config, formulas)
+        played = gymnasium.episodes(CheckedEnv(env, watch), run.agent, run.config, formulas)
+        return watch.over(played, run.agent, run.config.num_episodes)
     # Other callbacks may read and change the agent after each episode.
     only_logs = all(type(callback) is keras.callbacks.CSVLogger for callback in callbacks)
-    return compiled.episodes(env, spaces, run.agent, run.config, episodes_per_call if only_logs else 1, formulas)
+    at_once = episodes_per_call if only_logs else 1
+    played = compiled.episodes(env, spaces, run.agent, run.config, at_once, formulas)
+    return watch.over(played, run.agent, run.config.num_episodes)
 
 
 def _play_until_over(

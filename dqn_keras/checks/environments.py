@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Hashable
-from typing import Any, NamedTuple, SupportsFloat
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -10,6 +10,7 @@ from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras._engine.tensorflow import keras, require_xla, tf
 from dqn_keras.checks.networks import check_fits
+from dqn_keras.checks.observations import Watch, as_float, as_numbers, feature_name, shown
 from dqn_keras.environments import key_of_twin
 
 
@@ -17,15 +18,16 @@ class CheckedEnv:
     """A gymnasium.Env with Box observations and Discrete actions, whose return values are checked.
 
     States are returned as copies [*S], since an environment may reuse its buffer. Actions are indices from 0.
-    A wrong return value raises ValueError with the environment's name, the episode and the step.
+    A wrong return value raises ValueError with the environment's name, the episode and the step. The first states of a
+    run are also shown to its `watch`, if there is one.
     """
 
-    def __init__(self, env: gym.Env) -> None:
+    def __init__(self, env: gym.Env, watch: Watch | None = None) -> None:
         if not isinstance(env, gym.Env):
-            raise TypeError(f"env must be a gymnasium.Env, got {env!r}")
-        self.name = env.spec.id if env.spec else type(env.unwrapped).__name__
+            raise TypeError(f"env must be a gymnasium.Env, got {no_env(env)}")
+        self.name = env_name(env)
         self.spaces = check_spaces(self.name, env.observation_space, env.action_space)
-        self._env = env
+        self._env, self._watch = env, watch
         self._is_uint8 = self.spaces.state_dtype == np.uint8
 
     def reset(self, seed: int, episode: int) -> np.ndarray:
@@ -34,39 +36,45 @@ class CheckedEnv:
         result = self._call(self._env.reset, seed=seed)
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._error("reset() must return (observation, info)", result)
-        return self._checked_state(result[0])
+        return self._checked_state(*result)
 
     def step(self, a: int) -> tuple[np.ndarray, float, bool, bool]:
         """Takes the action of index `a` and returns next state, reward, terminated, truncated."""
         self._step += 1
         result = self._call(self._env.step, self.spaces.first_action + a)
         try:
-            observation, reward, terminated, truncated, _ = result
+            observation, reward, terminated, truncated, info = result
         except (TypeError, ValueError):
             wanted = "step() must return (observation, reward, terminated, truncated, info)"
             raise self._error(wanted, result) from None
         if type(reward) is not float:
-            if not isinstance(reward, SupportsFloat) or (isinstance(reward, np.ndarray) and reward.size != 1):
+            number = as_float(reward)
+            if number is None:
                 raise self._error("the reward must be a number", reward)
-            reward = float(reward)
+            reward = number
         if not abs(reward) <= _LARGEST:
             raise self._error("the reward must be finite in float32", reward)
         if not isinstance(terminated, _BOOLS) or not isinstance(truncated, _BOOLS):
             raise self._error("terminated and truncated must be booleans", (terminated, truncated))
-        return self._checked_state(observation), reward, bool(terminated), bool(truncated)
+        return self._checked_state(observation, info), reward, bool(terminated), bool(truncated)
 
-    def _checked_state(self, observation: Any) -> np.ndarray:
-        try:
-            state = np.array(observation, None if self._is_uint8 else np.float32)
-        except (TypeError, ValueError):
-            raise self._error("the observation must be an array of numbers", observation) from None
+    def _checked_state(self, observation: Any, info: Any) -> np.ndarray:
+        numbers = observation
+        if type(numbers) is not np.ndarray or numbers.dtype.kind not in "fiub":
+            numbers = as_numbers(observation)
+            if numbers is None:
+                raise self._error("the observation must be an array of numbers", observation)
+        state = np.array(numbers, None if self._is_uint8 else np.float32)
         if state.shape != self.spaces.state_shape:
             raise self._error(f"the observation must have shape {self.spaces.state_shape}", observation)
         if self._is_uint8:
             if state.dtype != np.uint8:
                 raise self._error("the observation must be of dtype uint8, as its space says", state.dtype)
         elif not (math.isfinite(sum(state.tolist())) if state.ndim == 1 else np.isfinite(state).all()):
-            raise self._error("the observation must be finite in float32", observation)
+            feature = feature_name(state.shape, int(np.isfinite(state).argmin()))
+            raise self._error(f"the observation must be finite in float32 ({feature} is not)", observation)
+        if self._watch is not None and not self._watch.see(numbers, info):
+            self._watch = None
         return state
 
     def _call(self, method: Callable, *args: Any, **kwargs: Any) -> Any:
@@ -80,7 +88,27 @@ class CheckedEnv:
         return f"in episode {self._episode}, {'at the reset' if self._step < 0 else f'step {self._step}'}"
 
     def _error(self, wanted: str, got: Any) -> ValueError:
-        return ValueError(f"env {self.name}: {wanted}, got {got!r} {self._where()}")
+        return ValueError(f"env {self.name}: {wanted}, got {shown(got)} {self._where()}")
+
+
+def env_name(env: gym.Env | FuncEnv) -> str:
+    """Returns the name by which messages call an environment: the id that it is registered by, or its class."""
+    if isinstance(env, FuncEnv):
+        return type(env).__name__
+    return env.spec.id if env.spec else type(env.unwrapped).__name__
+
+
+def no_env(thing: Any) -> str:
+    """Returns the end of a message about something that is no environment: what it is, and what makes one of it."""
+    if isinstance(thing, str):
+        return f'{thing!r}; gymnasium.make("{thing}") makes one'
+    if isinstance(thing, gym.envs.registration.EnvSpec):
+        return f"the EnvSpec of {thing.id}; gymnasium.make(spec) makes one"
+    if isinstance(thing, type) and issubclass(thing, gym.Env | FuncEnv):
+        return f"the class {thing.__name__}; {thing.__name__}() makes one"
+    if isinstance(thing, gym.vector.VectorEnv):
+        return f"the vector environment {shown(thing)}; one environment is played at a time, as gymnasium.make makes it"
+    return shown(thing)
 
 
 class Spaces(NamedTuple):
@@ -109,12 +137,37 @@ def check_spaces(name: str, observations: gym.Space, actions: gym.Space) -> Spac
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         raise ValueError(
             f"env {name} has the observation space {observations}; supported is a Box of at least one axis "
-            "(gymnasium.wrappers.FlattenObservation(env) makes one of most spaces, Discrete ones included)"
+            f"({way_to_a_box(observations)})"
         )
     if not isinstance(actions, gym.spaces.Discrete):
         raise ValueError(f"env {name} has the action space {actions}; supported is Discrete")
     dtype = np.dtype(np.uint8 if observations.dtype == np.uint8 else np.float32)
     return Spaces(observations.shape, dtype, int(actions.n), int(actions.start))
+
+
+def way_to_a_box(space: gym.Space) -> str:
+    """Returns the end of a message about an observation space: which wrappers make a Box of it."""
+    parts: dict[Any, gym.Space] = {}
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+        parts = dict(space.items() if isinstance(space, gym.spaces.Dict) else enumerate(space))
+    keys = [key for key, part in parts.items() if can_flatten(part) and not isinstance(part, gym.spaces.Text)]
+    if keys and len(keys) < len(parts):
+        wrapped = f"gymnasium.wrappers.FilterObservation(env, {keys})"
+        return f"gymnasium.wrappers.FlattenObservation({wrapped}) makes one of a part of it"
+    if can_flatten(space):
+        return "gymnasium.wrappers.FlattenObservation(env) makes one of it"
+    return "no wrapper of Gymnasium's makes a usable one of it, but a gymnasium.ObservationWrapper of your own can"
+
+
+def can_flatten(space: gym.Space) -> bool:
+    """Returns whether Gymnasium's FlattenObservation makes a vector of the space that is not empty and not huge."""
+    try:
+        return 0 < gym.spaces.flatdim(space) <= _LARGEST_VECTOR
+    except (NotImplementedError, ValueError):  # a space of the user's; a Sequence or a Graph, which have no fixed size
+        return False
+
+
+_LARGEST_VECTOR = 10**6
 
 
 _BOOLS = (bool, np.bool_)
@@ -137,7 +190,7 @@ _spaces_of_twins: dict[Hashable, Spaces] = {}
 
 
 def _check_functions(env: FuncEnv) -> Spaces:
-    name = type(env).__name__
+    name = env_name(env)
     spaces = check_spaces(name, env.observation_space, env.action_space)
     rng = tf.constant([0, 0], tf.int64)
     state = env.initial(rng)
@@ -154,6 +207,11 @@ def _check_functions(env: FuncEnv) -> Spaces:
     ]:
         if tuple(tf.shape(value)) != shape:
             raise ValueError(f"env {name}: {part} must have shape {shape}, got {tuple(tf.shape(value).numpy())}")
+        dtype = tf.convert_to_tensor(value).dtype
+        if not (dtype.is_floating or dtype.is_integer or dtype.is_bool):
+            raise ValueError(f"env {name}: {part} must be of numbers, got {dtype.name}")
+        if part == "observation" and spaces.state_dtype == np.uint8 != dtype:
+            raise ValueError(f"env {name}: observation must be of dtype uint8, as its space says, got {dtype.name}")
     return spaces
 
 
@@ -163,16 +221,12 @@ def check_environment(env: gym.Env | FuncEnv, q_network: keras.Model | None = No
     Raises:
         ValueError: the spaces are not supported, or do not fit `q_network` (None: the default network).
     """
-    if isinstance(env, FuncEnv):
-        name, spaces = type(env).__name__, check_functional(env)
-    else:
-        door = CheckedEnv(env)
-        name, spaces = door.name, door.spaces
+    spaces = check_functional(env) if isinstance(env, FuncEnv) else CheckedEnv(env).spaces
     if q_network is not None:
         check_fits(q_network, spaces.state_shape, spaces.num_actions)
     elif len(spaces.state_shape) != 1:
         raise ValueError(
-            f"env {name} has observations of shape {spaces.state_shape}, the default network takes one axis: "
+            f"env {env_name(env)} has observations of shape {spaces.state_shape}, the default network takes one axis: "
             "q_network must be a network of your own, got None (or wrap env in gymnasium.wrappers.FlattenObservation)"
         )
     return spaces

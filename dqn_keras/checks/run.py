@@ -10,6 +10,7 @@ from gymnasium.experimental.functional import FuncEnv
 from dqn_keras._engine.private import arguments_of_compile
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import owners_optimizer
+from dqn_keras.checks.environments import no_env
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.checks.networks import check_optimizer, warn_of_inference_mode
 from dqn_keras.config import Config
@@ -18,7 +19,7 @@ from dqn_keras.config import Config
 def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> None:
     """Raises TypeError or ValueError that names the wrong argument, if there is one."""
     if not isinstance(env, gym.Env | FuncEnv):
-        raise TypeError(f"env must be a gymnasium.Env or a FuncEnv, got {env!r}")
+        raise TypeError(f"env must be a gymnasium.Env or a FuncEnv, got {no_env(env)}")
     if not isinstance(config, Config):
         raise TypeError(f"config must be a Config, got {config!r}")
     if verbose not in (0, 1, 2):

@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 
 from dqn_keras import environments
 from dqn_keras._engine.tensorflow import keras
-from dqn_keras.checks.environments import check_environment
+from dqn_keras.checks.environments import can_flatten, check_environment, way_to_a_box
 from dqn_keras.config import Config
 from dqn_keras.interruption import TrainingInterrupted
 from dqn_keras.metrics import LOGGED
@@ -66,12 +66,12 @@ class EnvOptions:
         except Exception as error:  # in the environment's code, about an argument that it does not take
             arguments = "".join(f" {name}={value!r}" for name, value in self.arguments.items())
             raise ValueError(f"{self.id}{arguments} cannot be made: {type(error).__name__}: {error}") from error
-        if self.flatten:
-            return gym.wrappers.FlattenObservation(env)
-        if not isinstance(env.observation_space, gym.spaces.Box):
-            space = env.observation_space
-            raise ValueError(f"{self.id} has the observation space {space}; --flatten makes one axis of it")
-        return env
+        space = env.observation_space
+        is_flat = self.flatten and can_flatten(space)
+        if not is_flat and (self.flatten or not isinstance(space, gym.spaces.Box)):
+            way = "--flatten makes one axis of it" if can_flatten(space) else way_to_a_box(space)
+            raise ValueError(f"{self.id} has the observation space {space}; {way}")
+        return gym.wrappers.FlattenObservation(env) if is_flat else env
 
     def make_for_training(self) -> Any:
         """Makes the Gymnasium environment, or its functional twin if episodes are compiled."""
