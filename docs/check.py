@@ -14,7 +14,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import unquote, urldefrag, urlsplit
 
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, Request, sync_playwright
 
 SITE = Path(__file__).parent.parent / "site"
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -80,7 +80,7 @@ def look(page: Page, host: str, name: str, problems: list[str]) -> dict:
     listeners = {
         "console": lambda message: message.type == "error" and problems.append(f"console: {message.text}"),
         "pageerror": lambda error: problems.append(f"error: {error}"),
-        "requestfailed": lambda request: problems.append(f"request failed: {request.url}"),
+        "requestfailed": lambda request: is_failure(request) and problems.append(f"request failed: {request.url}"),
         "request": lambda request: foreign(request.url, host) and problems.append(f"another host: {request.url}"),
         "response": lambda response: response.status >= 400 and problems.append(f"{response.status}: {response.url}"),
     }
@@ -88,6 +88,7 @@ def look(page: Page, host: str, name: str, problems: list[str]) -> dict:
         page.on(event, listener)
     page.goto(f"{host}/{name}", wait_until="networkidle")
     found = page.evaluate(LOOK)
+    page.wait_for_load_state("networkidle")  # pictures further down are loaded when `LOOK` decodes them
     for event, listener in listeners.items():
         page.remove_listener(event, listener)
     for image in found["images"]:
@@ -97,6 +98,11 @@ def look(page: Page, host: str, name: str, problems: list[str]) -> dict:
             problems.append(f"picture without alt text: {image['src']}")
     problems.extend(f"LaTeX left in the text: {text.strip()[:80]}" for text in found["latex"])
     return found
+
+
+def is_failure(request: Request) -> bool:
+    """Whether the request failed by itself: the browser cancels those of a page that it leaves."""
+    return request.failure != "net::ERR_ABORTED"
 
 
 def foreign(url: str, host: str) -> bool:
