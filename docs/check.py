@@ -48,6 +48,7 @@ def check(browser: Browser, host: str) -> int:
     wrong: dict[str, list[str]] = {name: [] for name in names}
     seen, moving = {}, 0
     page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.set_default_timeout(120_000)  # a busy machine may be slow
     for name in names:
         seen[name] = look(page, host, name, wrong[name])
         for image in seen[name]["images"]:
@@ -139,7 +140,7 @@ def finds(page: Page, host: str, word: str) -> bool:
     page.goto(f"{host}/index.html")
     page.locator("input.md-search__input").fill(word)
     results = page.locator("a.md-search-result__link")
-    results.first.wait_for(state="attached", timeout=10_000)
+    results.first.wait_for(state="attached")
     return results.count() > 0
 
 
