@@ -133,7 +133,7 @@ def parts_of_a_turn() -> dict[str, Callable[[tf.Tensor], tf.Tensor]]:
         return tf.while_loop(lambda j, *_: j < CONFIG.steps_per_update, step, start)[2]
 
     def sample(i: tf.Tensor) -> tf.Tensor:
-        drawn = sample_indices(bits(i)[2 * CONFIG.steps_per_update :], key, i, CONFIG.memory_size)
+        drawn = sample_indices(bits(i)[2 * CONFIG.steps_per_update :], key, i, CONFIG.memory_size, CONFIG.memory_size)
         return tf.reduce_sum(unpack(tf.gather(rows, drawn), (4,)).state)
 
     def loss(i: tf.Tensor) -> tf.Tensor:

@@ -14,7 +14,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import unquote, urldefrag, urlsplit
 
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, Request, sync_playwright
 
 SITE = Path(__file__).parent.parent / "site"
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -48,6 +48,7 @@ def check(browser: Browser, host: str) -> int:
     wrong: dict[str, list[str]] = {name: [] for name in names}
     seen, moving = {}, 0
     page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.set_default_timeout(120_000)  # a busy machine may be slow
     for name in names:
         seen[name] = look(page, host, name, wrong[name])
         for image in seen[name]["images"]:
@@ -80,7 +81,7 @@ def look(page: Page, host: str, name: str, problems: list[str]) -> dict:
     listeners = {
         "console": lambda message: message.type == "error" and problems.append(f"console: {message.text}"),
         "pageerror": lambda error: problems.append(f"error: {error}"),
-        "requestfailed": lambda request: problems.append(f"request failed: {request.url}"),
+        "requestfailed": lambda request: is_failure(request) and problems.append(f"request failed: {request.url}"),
         "request": lambda request: foreign(request.url, host) and problems.append(f"another host: {request.url}"),
         "response": lambda response: response.status >= 400 and problems.append(f"{response.status}: {response.url}"),
     }
@@ -88,6 +89,7 @@ def look(page: Page, host: str, name: str, problems: list[str]) -> dict:
         page.on(event, listener)
     page.goto(f"{host}/{name}", wait_until="networkidle")
     found = page.evaluate(LOOK)
+    page.wait_for_load_state("networkidle")  # pictures further down are loaded when `LOOK` decodes them
     for event, listener in listeners.items():
         page.remove_listener(event, listener)
     for image in found["images"]:
@@ -97,6 +99,11 @@ def look(page: Page, host: str, name: str, problems: list[str]) -> dict:
             problems.append(f"picture without alt text: {image['src']}")
     problems.extend(f"LaTeX left in the text: {text.strip()[:80]}" for text in found["latex"])
     return found
+
+
+def is_failure(request: Request) -> bool:
+    """Whether the request failed by itself: the browser cancels those of a page that it leaves."""
+    return request.failure != "net::ERR_ABORTED"
 
 
 def foreign(url: str, host: str) -> bool:
@@ -133,7 +140,7 @@ def finds(page: Page, host: str, word: str) -> bool:
     page.goto(f"{host}/index.html")
     page.locator("input.md-search__input").fill(word)
     results = page.locator("a.md-search-result__link")
-    results.first.wait_for(state="attached", timeout=10_000)
+    results.first.wait_for(state="attached")
     return results.count() > 0
 
 

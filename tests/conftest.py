@@ -70,6 +70,7 @@ def in_another_process():
             capture_output=True,
             text=True,
             check=True,
+            timeout=600,
         ).stdout.strip()
 
     return run

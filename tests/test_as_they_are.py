@@ -329,14 +329,12 @@ def test_a_learning_rate_that_is_a_python_function_is_called_once_and_that_is_sa
 
 
 def test_learn_calls_a_learning_rate_that_is_a_python_function_at_each_step(random_batch):
-    rates = iter([0.1, 0.1, 0.0, 0.0])
     now = [0.1]
     networks, optimizer, batch = fresh(), keras.optimizers.SGD(lambda: now[0]), random_batch(8)
     learn(batch, 0.9, *networks, optimizer)
     now[0] = 0.0
     before = networks[0].get_weights()
     np.testing.assert_array_equal(before[0], learned(batch, networks, optimizer)[0])
-    del rates
 
 
 class Forgetful(keras.layers.Layer):

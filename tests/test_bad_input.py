@@ -148,7 +148,3 @@ OTHERS = {
 def test_a_bad_input_is_told(call, message):
     with pytest.raises((TypeError, ValueError), match=f"^{message}"):
         call()
-
-
-def test_they_are_no_fewer_than_the_originals():
-    assert len(CONFIGS) + len(OTHERS) >= 64

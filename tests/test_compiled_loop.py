@@ -84,7 +84,7 @@ def test_its_draws_actions_and_updates_replayed_step_by_step_through_learn_agree
                 assert q_values[a] >= q_values.max() - 1e-3
             num_steps += 1
             if t % n == 0 and num_steps >= batch_size:
-                indices = sample_indices(bits[2 * n :], key, turn, num_steps).numpy()
+                indices = sample_indices(bits[2 * n :], key, turn, num_steps, config.memory_size).numpy()
                 learn(unpack(rows[indices], (4,)), config.gamma, *agent.learner, tau=config.tau)
                 updates += 1
         epsilon = decay_epsilon(epsilon, config)
@@ -96,25 +96,47 @@ def test_its_draws_actions_and_updates_replayed_step_by_step_through_learn_agree
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [64, 65, 100, 5_000])
-def test_a_batch_has_no_repeats_and_is_uniform(size):
+@pytest.mark.parametrize(
+    ("batch_size", "size", "memory_size"),
+    [
+        *[(64, 64, 5_000), (64, 65, 5_000), (64, 100, 5_000), (64, 5_000, 5_000)],  # repeats are drawn again
+        *[(64, 64, 64), (64, 65, 65), (64, 90, 100), (64, 255, 255)],  # a large part of the memory
+        *[(130, 130, 5_000), (130, 520, 5_000), (130, 521, 5_000)],  # a large batch of an almost empty memory
+    ],
+)
+def test_a_batch_has_no_repeats_and_is_uniform(batch_size, size, memory_size):
     @tf.function(jit_compile=True)
     def draw(key):
         def one(i):
-            return sample_indices(draw_bits(64, key, i), key, i, size)
+            return sample_indices(draw_bits(batch_size, key, i), key, i, size, memory_size)
 
         return tf.map_fn(one, tf.range(2_000), fn_output_signature=tf.int32)
 
     batches = draw(tf.constant(1, tf.int64)).numpy()
-    assert all(len(set(batch)) == 64 for batch in batches)
+    assert all(len(set(batch)) == batch_size for batch in batches)
     counts = np.bincount(batches.ravel(), minlength=size)
     assert len(counts) == size
-    if size == 64:
+    if size == batch_size:
         assert (counts == 2_000).all()
     else:  # without replacement the counts vary less than a multinomial's, by this factor
-        statistic = ((counts - counts.mean()) ** 2 / counts.mean()).sum() / (1 - 64 / size)
+        statistic = ((counts - counts.mean()) ** 2 / counts.mean()).sum() / (1 - batch_size / size)
         assert 1e-4 < stats.chi2.sf(statistic, size - 1) < 1 - 1e-4
-    assert stats.chisquare(np.bincount(batches[:, -1], minlength=size)).pvalue > 1e-4
+    for place in (0, -1):
+        assert stats.chisquare(np.bincount(batches[:, place], minlength=size)).pvalue > 1e-4
+
+
+@pytest.mark.parametrize(("batch_size", "memory_size"), [(3_000, 3_000), (2_700, 3_000), (1_000, 3_000)])
+def test_a_batch_that_is_a_large_part_of_the_memory_is_drawn_without_attempts(batch_size, memory_size):
+    @tf.function
+    def draw(counter):
+        key = tf.constant(1, tf.int64)
+        return sample_indices(draw_bits(batch_size, key, counter), key, counter, memory_size, memory_size)
+
+    operations = {x.type for x in draw.get_concrete_function(tf.TensorSpec((), tf.int32)).graph.get_operations()}
+    assert not any("While" in x for x in operations)
+    first, second = draw(tf.constant(0)).numpy(), draw(tf.constant(1)).numpy()
+    assert len(set(first)) == len(set(second)) == batch_size
+    assert not np.array_equal(first, second)
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ def start(script=SCRIPT, **environment):
 
 
 def output(process):
-    out, err = process.communicate()
+    out, err = process.communicate(timeout=600)
     assert (process.returncode, err) == (0, "")
     return out
 

@@ -17,6 +17,7 @@ from dqn_keras._engine.made_here import units_if_made_here
 from dqn_keras._engine.private import (
     caller,
     can_swap_variables,
+    forget_kernels_now_and_then,
     handle,
     is_built_for,
     is_plain_adam,
@@ -51,6 +52,7 @@ class Learner(NamedTuple):
         if not q_network.trainable_variables:
             raise ValueError("q_network must have weights that can be trained, got none")
         if not optimizer.built:
+            forget_kernels_now_and_then()
             optimizer.build(q_network.trainable_variables)
         if not is_built_for(optimizer, q_network.trainable_variables):
             raise ValueError(

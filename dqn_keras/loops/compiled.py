@@ -251,7 +251,7 @@ class _Loop:
         size = tf.cast(tf.minimum(self._num_appended, memory_size), tf.int32)
         loss, mean_q, max_q, td_error = tf.cond(
             is_update,
-            lambda: self._update(sample_indices(bits[2 * n :], key, number, size)),
+            lambda: self._update(sample_indices(bits[2 * n :], key, number, size, memory_size)),
             lambda: _NO_UPDATE,
         )
         fault = tf.where(tf.math.is_finite(loss), fault, _DIVERGED)

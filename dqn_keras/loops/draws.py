@@ -24,8 +24,30 @@ def to_integer(bits: tf.Tensor, bound: Any) -> tf.Tensor:
     return tf.cast(tf.bitwise.right_shift(product, tf.constant(32, tf.uint64)), tf.int32)
 
 
-def sample_indices(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any) -> tf.Tensor:
-    """Draws as many different indices in [0, size) as there are bits, uniformly: repeats are drawn again.
+def sample_indices(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any, memory_size: int) -> tf.Tensor:
+    """Draws as many different indices in [0, size) as there are bits, uniformly; `size` is at most `memory_size`.
+
+    Repeats are drawn again, unless the batch is a large part of the memory: a batch of the whole memory would need as
+    many attempts as it has indices. For a small batch that does little harm in a run's first updates, when a large
+    memory is nearly empty.
+    """
+    batch_size = bits.shape[0]
+    if 4 * batch_size > memory_size:
+        return _first_in_random_order(batch_size, memory_size, key, counter, size)
+    if batch_size <= _SMALL_BATCH:
+        return _redraw_repeats(bits, key, counter, size)
+    return tf.cond(
+        tf.convert_to_tensor(size) <= 4 * batch_size,
+        lambda: _first_in_random_order(batch_size, 4 * batch_size, key, counter, size),
+        lambda: _redraw_repeats(bits, key, counter, size),
+    )
+
+
+_SMALL_BATCH = 128
+
+
+def _redraw_repeats(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any) -> tf.Tensor:
+    """Draws different indices in [0, size): repeats are drawn again.
 
     An index is drawn again only if it equals an earlier one. This rule treats all values alike, so by symmetry all sets
     of different indices are equally likely.
@@ -44,6 +66,13 @@ def sample_indices(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any) -> 
     indices = to_integer(bits, size)
     start = (indices, repeats(indices), tf.constant(_NEXT_ATTEMPT, tf.int64))
     return tf.while_loop(lambda _, is_repeat, __: tf.reduce_any(is_repeat), redraw, start)[0]
+
+
+def _first_in_random_order(num: int, most: int, key: tf.Tensor, counter: Any, size: Any) -> tf.Tensor:
+    """Returns the first `num` of the indices in [0, size), sorted by random bits; `size` is at most `most`."""
+    order = draw_bits(most, key, tf.cast(counter, tf.int64) + _NEXT_ATTEMPT)
+    order = tf.where(tf.range(most) < size, tf.cast(order, tf.int64), -1)
+    return tf.math.top_k(order, num).indices
 
 
 _NEXT_ATTEMPT = 2**32  # larger than the number of any turn

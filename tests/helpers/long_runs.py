@@ -1,0 +1,106 @@
+"""Many agents, runs and studies in one process: what they leave behind."""
+
+import gc
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from unittest import mock
+
+import gymnasium as gym
+import keras
+import numpy as np
+import psutil
+from joblib.externals.loky import get_reusable_executor
+
+from dqn_keras import Config, learn, make_networks, study, train
+from dqn_keras.environments import CartPole
+
+TINY = Config(num_episodes=2, batch_size=4, max_steps=20, solved_window=1)
+WARM_UP = 40  # what the first ones compile and allocate stays
+SHARED_MEMORY = Path("/dev/shm")
+
+
+def resident() -> float:
+    """Resident memory of this process in MB, without garbage."""
+    gc.collect()
+    return psutil.Process().memory_info().rss / 1e6
+
+
+def held(folder: Path) -> dict[str, int]:
+    """The number of things other than memory that this process holds; `folder` has its temporary files and its cache.
+
+    Joblib's empty folders in the shared memory, one for each study in workers, stay until the process ends.
+    """
+    process, temporary = psutil.Process(), [x for x in folder.iterdir() if x.name != "cache"]
+    return {
+        "file descriptors": process.num_fds(),
+        "threads": process.num_threads(),
+        "processes": len(process.children(recursive=True)),
+        "temporary files": len(temporary),
+        "files in shared memory": sum(x.is_file() and str(process.pid) in x.name for x in SHARED_MEMORY.iterdir()),
+        "folders of processes in the cache": len(list(folder.glob("cache/*/process-*"))),
+    }
+
+
+def use_an_agent(seed: int) -> None:
+    """Makes an agent as a script does, lets it learn, and drops it."""
+    rng = np.random.default_rng(seed)
+    states, next_states = rng.normal(size=(2, 8, 4)).astype(np.float32)
+    batch = states, rng.integers(2, size=8), np.ones(8, np.float32), next_states, np.zeros(8, np.float32)
+    q_network, q_hat_network = make_networks(4, 2, seed=seed)
+    optimizer = keras.optimizers.Adam()
+    for _ in range(3):
+        learn(batch, 0.95, q_network, q_hat_network, optimizer)
+
+
+def train_in_both_loops(seed: int) -> None:
+    """Trains twice, in the Gymnasium loop and in compiled episodes."""
+    with gym.make("CartPole-v1") as env:
+        train(env, TINY, seed, verbose=0)
+    train(CartPole(), TINY, seed, verbose=0)
+
+
+def study_here(seed: int) -> None:
+    """A study of two seeds in this process."""
+    study(CartPole(), TINY, [seed, seed + 1], num_workers=1, verbose=0)
+
+
+def study_in_workers(seed: int) -> None:
+    """A study of two seeds in two worker processes, which joblib keeps for the next one."""
+    study(CartPole(), TINY, [seed, seed + 1], num_workers=2, verbose=0)
+
+
+def study_in_new_workers(num_studies: int) -> None:
+    """Studies in two worker processes, which end after the last one."""
+    for seed in range(num_studies):
+        study_in_workers(seed)
+    get_reusable_executor().shutdown(wait=True)
+
+
+def growth(use: Callable[[int], None], number: int) -> float:
+    """The resident memory in MB that `number` uses add, after some for warming up."""
+    for seed in range(WARM_UP):
+        use(seed)
+    before = resident()
+    for seed in range(number):
+        use(seed)
+    return resident() - before
+
+
+def long_runs(num_agents: int, num_trains: int, num_studies: int, num_in_workers: int) -> dict[str, float]:
+    """The growth of memory in MB for each kind of use, and how many other things are left at the end."""
+    with tempfile.TemporaryDirectory() as folder:
+        own = {"TMPDIR": folder, "DQN_KERAS_CACHE": f"{folder}/cache"}
+        with mock.patch.dict(os.environ, own), mock.patch.object(tempfile, "tempdir", folder):
+            for use in (use_an_agent, train_in_both_loops, study_here, study_in_new_workers):
+                use(1)  # TensorFlow starts its threads, and Python its process that looks after shared memory
+            before = held(Path(folder))
+            figures = {
+                f"MB more after {num_agents} agents of learn": growth(use_an_agent, num_agents),
+                f"MB more after {num_trains} runs": growth(train_in_both_loops, num_trains // 2),
+                f"MB more after {num_studies} studies": growth(study_here, num_studies),
+            }
+            study_in_new_workers(num_in_workers)
+            after = held(Path(folder))
+    return figures | {f"{name} left": after[name] - before[name] for name in before}

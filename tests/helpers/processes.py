@@ -1,0 +1,15 @@
+"""Upper bounds for processes that a test waits for."""
+
+import contextlib
+import threading
+
+
+@contextlib.contextmanager
+def killed_after(seconds, process):
+    """Kills a process that is still running when the time is over, so that nobody waits for it forever."""
+    timer = threading.Timer(seconds, process.kill)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
