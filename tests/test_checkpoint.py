@@ -20,7 +20,7 @@ from dqn_keras.storage.identity import identity
 from dqn_keras.storage.networks import save_q_network
 from tests.helpers import faults
 from tests.helpers.environments import Corridor
-from tests.helpers.faults import CONFIG, LOOPS, SEED, child_process, files, final_bits, newest, play, try_to_train
+from tests.helpers.faults import CONFIG, LOOPS, SEED, files, final_bits, newest, play
 from tests.helpers.runs import Tape, fingerprint
 
 QUICK = dataclasses.replace(CONFIG, num_episodes=40)
@@ -263,14 +263,9 @@ def test_a_second_run_is_refused_while_one_writes_in_the_folder(tmp_path):
 
 
 def test_two_processes_that_start_at_once_leave_one_whole_run(tmp_path):
-    processes = [child_process(try_to_train, "Gymnasium loop", tmp_path / "run", tmp_path / f"{k}") for k in range(2)]
-    for process in processes:
-        process.join()
-    reports = {(tmp_path / f"{k}").read_text() for k in range(2)}
-    assert "trained" in reports
-    assert reports <= {"trained", f"checkpoint {tmp_path / 'run'} is in use: another process or thread writes there"}
-    play("Gymnasium loop", tmp_path / "alone")
-    assert final_bits(tmp_path / "run") == final_bits(tmp_path / "alone")
+    figures = faults.race_campaign(tmp_path, 1)
+    assert figures["pairs"] == 1
+    assert figures["differing runs"] == 0
 
 
 def test_only_older_files_of_the_same_run_are_deleted(tmp_path):

@@ -1,3 +1,4 @@
+import contextlib
 import dataclasses
 import errno
 import hashlib
@@ -289,11 +290,12 @@ def kill_a_busy_worker(killed):
     """Kill the first process that is at a seed."""
     deadline = time.monotonic() + 600
     while not killed and time.monotonic() < deadline:
-        for process in psutil.process_iter(["cmdline"]):
-            if "ray::_train_seed" in " ".join(process.info["cmdline"] or []):
-                os.kill(process.pid, signal.SIGKILL)
-                killed.append(process.pid)
-                return
+        for process in psutil.Process().children(recursive=True):
+            with contextlib.suppress(psutil.Error):  # it has ended
+                if "ray::_train_seed" in " ".join(process.cmdline()):
+                    process.kill()
+                    killed.append(process.pid)
+                    return
         time.sleep(0.05)
 
 

@@ -469,6 +469,24 @@ def try_to_train(loop, folder, started, report):
         Path(report).write_text("trained")
 
 
+def race_campaign(folder, number):
+    """Start two processes at once in one folder -> pairs, those refused, and runs that differ from one alone."""
+    folder, figures = Path(folder), {"pairs": 0, "refused by the lock": 0, "differing runs": 0}
+    play("Gymnasium loop", folder / "alone")
+    for k in range(number):
+        processes = [
+            child_process(try_to_train, "Gymnasium loop", folder / str(k), folder / f"{k} {i}") for i in range(2)
+        ]
+        for process in processes:
+            process.join()
+        said = [(folder / f"{k} {i}").read_text() for i in range(2)]
+        figures["pairs"] += 1
+        figures["refused by the lock"] += sum("is in use" in x for x in said)
+        is_whole = "trained" in said and final_bits(folder / str(k)) == final_bits(folder / "alone")
+        figures["differing runs"] += not (is_whole and len(files(folder / str(k))) == 2)
+    return figures
+
+
 def _after_first_checkpoint(folder):
     """Wait for it, with which a run begins: -> the time."""
     start = time.perf_counter()
