@@ -28,8 +28,8 @@ from dqn_keras._engine.libraries import is_of_a_library
 from dqn_keras._engine.programs import shared_in
 from dqn_keras._engine.recycling import recycle
 from dqn_keras._engine.tensorflow import tf
-from dqn_keras.checks.numbers import check_count
-from dqn_keras.checks.run import check_arguments
+from dqn_keras.checks.numbers import check_count, check_path, shown
+from dqn_keras.checks.run import check_arguments, check_seeds
 from dqn_keras.config import Config
 from dqn_keras.progress import tqdm
 from dqn_keras.storage.files import FORMAT, from_bytes, replacing, to_bytes
@@ -125,14 +125,13 @@ def study(
         TypeError, ValueError: as for `train`; or `file` is of another study (the message begins with what differs).
     """
     check_arguments(env, config, verbose)
-    seeds = [check_count("seeds", seed, at_least=0) for seed in seeds]
-    if len(set(seeds)) < len(seeds):
-        raise ValueError(f"seeds must name each seed once, got {seeds}")
-    if engine not in _ENGINES:
-        raise ValueError(f"engine must be one of {', '.join(_ENGINES)}, got {engine!r}")
+    seeds = check_seeds(seeds)
+    if not isinstance(engine, str) or engine not in _ENGINES:
+        raise ValueError(f"engine must be one of {', '.join(_ENGINES)}, got {shown(engine)}")
     num_workers = cpu_count() if num_workers is None else check_count("num_workers", num_workers)
+    file = None if file is None else check_path("file", file)
     facts = {} if file is None else {"format": FORMAT, **identity_of_study(env, config)}
-    outcomes = {} if file is None else _load(Path(file), facts)
+    outcomes = {} if file is None else _load(file, facts)
 
     missing = [seed for seed in seeds if seed not in outcomes]
     bar = tqdm(total=len(seeds), initial=len(seeds) - len(missing), unit="seed", disable=not verbose)
@@ -146,13 +145,13 @@ def study(
                 outcomes[outcome.seed] = outcome
                 bar.update()
                 if file is not None and time.monotonic() > saved_at + _SECONDS_BETWEEN_SAVES:
-                    _save(Path(file), outcomes, facts)
+                    _save(file, outcomes, facts)
                     saved_at = time.monotonic()
         except KeyboardInterrupt:
             interrupted = True
         finally:
             if file is not None and missing:
-                _save(Path(file), outcomes, facts)
+                _save(file, outcomes, facts)
     if interrupted:
         unfinished = sum(seed not in outcomes for seed in seeds)
         warnings.warn(f"{unfinished} of {len(seeds)} seeds are not in this study: it was interrupted", stacklevel=2)
@@ -312,13 +311,13 @@ def _load(path: Path, facts: dict[str, Any]) -> dict[int, Outcome]:
     """Returns the outcomes by seed; none if there is no file yet."""
     if not path.exists():
         return {}
-    outcomes, theirs = _read(path)
+    outcomes, theirs = _read("file", path)
     check_is_same(path, theirs, facts)
     warn_of_other_versions(path, theirs, facts, stacklevel=4)
     return outcomes
 
 
-def _read(path: Path) -> tuple[dict[int, Outcome], dict[str, Any]]:
+def _read(argument: str, path: Path) -> tuple[dict[int, Outcome], dict[str, Any]]:
     """Returns the outcomes by seed, and the facts of the study; nothing in the file is taken on trust."""
     try:
         columns, facts = from_bytes(path.read_bytes())
@@ -331,7 +330,7 @@ def _read(path: Path) -> tuple[dict[int, Outcome], dict[str, Any]]:
             outcomes[seed] = Outcome(seed, rewards, steps, solved_at, bytes.fromhex(digest))
             _check_outcome(outcomes[seed], config)
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"file {path} is not a study that can be loaded: {error}") from error
+        raise ValueError(f"{argument} {path} is not a study that can be loaded: {error}") from error
     return outcomes, facts
 
 
@@ -363,5 +362,5 @@ def load_study(path: str | os.PathLike) -> Study:
         FileNotFoundError: the file does not exist.
         ValueError: the file is damaged, or something in it cannot be from a study; the message names the file.
     """
-    outcomes, facts = _read(Path(path))
+    outcomes, facts = _read("path", check_path("path", path))
     return Study(_config(facts), list(outcomes.values()))

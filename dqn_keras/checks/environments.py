@@ -10,6 +10,7 @@ from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras._engine.tensorflow import keras, require_xla, tf
 from dqn_keras.checks.networks import check_fits
+from dqn_keras.checks.numbers import shown
 from dqn_keras.environments import key_of_twin
 
 
@@ -22,7 +23,7 @@ class CheckedEnv:
 
     def __init__(self, env: gym.Env) -> None:
         if not isinstance(env, gym.Env):
-            raise TypeError(f"env must be a gymnasium.Env, got {env!r}")
+            raise TypeError(f"env must be a gymnasium.Env, got {shown(env)}")
         self.name = env.spec.id if env.spec else type(env.unwrapped).__name__
         self.spaces = check_spaces(self.name, env.observation_space, env.action_space)
         self._env = env
