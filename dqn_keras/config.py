@@ -3,11 +3,11 @@
 import dataclasses
 from typing import Any
 
-import numpy as np
+from dqn_keras.checks.fields import hints_at_fields
+from dqn_keras.checks.numbers import check_count, check_counts, check_flag, check_number
 
-from dqn_keras.checks.numbers import check_count, check_counts, check_number
 
-
+@hints_at_fields
 @dataclasses.dataclass(frozen=True)
 class Config:
     """The parameters of a run. The defaults are the original notebook's.
@@ -58,9 +58,7 @@ class Config:
         self._set("epsilon_min", check_number("epsilon_min", self.epsilon_min, at_least=0, at_most=self.epsilon))
         self._set("solved_reward", check_number("solved_reward", self.solved_reward))
         self._set("hidden_units", check_counts("hidden_units", self.hidden_units))
-        if not isinstance(self.jit_compile, bool | np.bool_):
-            raise TypeError(f"jit_compile must be True or False, got {self.jit_compile!r}")
-        self._set("jit_compile", bool(self.jit_compile))
+        self._set("jit_compile", check_flag("jit_compile", self.jit_compile))
         if self.batch_size > self.memory_size:
             raise ValueError(
                 f"batch_size must be at most memory_size={self.memory_size}, got {self.batch_size}: "

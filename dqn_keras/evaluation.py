@@ -28,11 +28,8 @@ def evaluate(
     """
     checked_env = CheckedEnv(env)
     check_fits(q_network, checked_env.spaces.state_shape, checked_env.spaces.num_actions)
-    num_episodes, max_steps, seed = (
-        check_count("num_episodes", num_episodes),
-        check_count("max_steps", max_steps),
-        checked_seed(seed),
-    )
+    num_episodes, max_steps = check_count("num_episodes", num_episodes), check_count("max_steps", max_steps)
+    seed = checked_seed(seed)
     q_values = q_function(q_network)
     returns = np.zeros(num_episodes)
     for episode in range(num_episodes):

@@ -13,7 +13,8 @@ from dqn_keras._engine.steps import compiled_step
 from dqn_keras._engine.tensorflow import keras, tf
 from dqn_keras.checks.batches import as_batch, as_share, takes_a_batch
 from dqn_keras.checks.formulas import Formulas
-from dqn_keras.checks.networks import check_network
+from dqn_keras.checks.networks import check_network, check_pair
+from dqn_keras.checks.numbers import check_flag
 from dqn_keras.replay import Experience
 
 
@@ -70,6 +71,7 @@ def loss_values(experiences: Experience, gamma: Any, q_network: keras.Model, q_h
 
 def update_q_hat(q_network: keras.Model, q_hat_network: keras.Model, tau: Any = 0.01) -> None:
     """Moves Q-hat's weights a little towards Q's: theta_hat <- tau theta + (1 - tau) theta_hat."""
+    check_pair(q_network, q_hat_network)
     tau = as_share("tau", tau)
     for q_weights, q_hat_weights in zip(q_network.weights, q_hat_network.weights, strict=True):
         is_float = tf.as_dtype(q_weights.dtype).is_floating  # integers, such as a counter, are copied
@@ -169,17 +171,18 @@ def learn(
     """
     check_network("q_network", q_network)
     check_network("q_hat_network", q_hat_network)
+    batch = as_batch(experiences, q_network.input_shape[1:], q_network.output_shape[-1])
+    gamma, tau = as_share("gamma", gamma), as_share("tau", tau)
+    jit_compile = check_flag("jit_compile", jit_compile)
     learner, formulas = Learner(q_network, q_hat_network, optimizer), Formulas(targets, loss)
     if not tf.executing_eagerly():  # inside the caller's tf.function, which compiles it
         formulas.check()
         with tf.init_scope():
             learner.prepare()
-        batch = as_batch(experiences, q_network.input_shape[1:], q_network.output_shape[-1])
-        return gradient_step(batch, as_share("gamma", gamma), *learner, tau, formulas).loss
-    batch = as_batch(experiences, q_network.input_shape[1:], q_network.output_shape[-1])
+        return gradient_step(batch, gamma, *learner, tau, formulas).loss
     make_step, batch_size = partial(_make_step, formulas), batch.reward.shape[0]
     step = compiled_step(make_step, learner, formulas, packages(formulas), batch_size, jit_compile)
-    return step(*batch, as_share("gamma", gamma), as_share("tau", tau))[0]
+    return step(*batch, gamma, tau)[0]
 
 
 def _make_step(formulas: Formulas, learner: Learner) -> Callable[..., tf.Tensor]:

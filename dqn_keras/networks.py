@@ -6,7 +6,7 @@ import numpy as np
 
 from dqn_keras._engine.made_here import _made_here
 from dqn_keras._engine.tensorflow import keras, tf
-from dqn_keras.checks.numbers import check_count, check_counts
+from dqn_keras.checks.numbers import check_count, check_counts, shown
 
 
 def make_q_network(
@@ -19,10 +19,15 @@ def make_q_network(
     """Returns a feed-forward Q-network: states [B, num_features] -> Q-values [B, num_actions], float32.
 
     Hidden layers use ReLU; the output is linear. Kernels start Glorot uniform (Keras' default), drawn from `seed`
-    without touching any global random state. Biases start at zero.
+    without touching any global random state: a whole number, a SeedSequence, or None for a random one. Biases start at
+    zero.
     """
     num_features, num_actions = check_count("num_features", num_features), check_count("num_actions", num_actions)
     hidden_units = check_counts("hidden_units", hidden_units)
+    if not isinstance(name, str) or not name or "/" in name:
+        raise ValueError(f"name must be a string of at least one character, without '/', got {shown(name)}")
+    if not (seed is None or isinstance(seed, np.random.SeedSequence)):
+        seed = check_count("seed", seed, at_least=0)
     *hidden, output = _initializers(len(hidden_units) + 1, seed)
     layers: list[keras.Layer] = [keras.Input(shape=(num_features,), dtype="float32")]
     for i, (units, initializer) in enumerate(zip(hidden_units, hidden, strict=True), start=1):

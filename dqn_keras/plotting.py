@@ -1,12 +1,21 @@
 """Learning curves: of one run, together with its other logged values, and of many runs."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from dqn_keras.checks.numbers import check_count
+from dqn_keras.checks.numbers import (
+    check_array,
+    check_count,
+    check_flag,
+    check_instance,
+    check_number,
+    check_sequence,
+    shown,
+)
 from dqn_keras.config import Config
 from dqn_keras.study import Study
 from dqn_keras.training import Run
@@ -21,11 +30,10 @@ def plot_rewards(rewards: Sequence[float] | np.ndarray, ax: Axes | None = None, 
         window: number of episodes in the moving average.
     """
     window = check_count("window", window)
-    rewards = np.asarray(rewards, np.float64)
-    if rewards.ndim != 1:
-        raise ValueError(f"rewards must have one axis, got shape {rewards.shape}")
+    rewards = check_array("rewards", rewards, num_axes=1).astype(np.float64)
     if ax is None:
         _, ax = plt.subplots(figsize=(10, 5))
+    check_instance("ax", ax, Axes, "an Axes of Matplotlib")
     ax.plot(rewards, label="Episode reward", color="tab:blue", alpha=0.4, linewidth=1)
     if len(rewards) >= window:
         smoothed = np.convolve(rewards, np.full(window, 1 / window), mode="valid")
@@ -48,11 +56,13 @@ def plot_run(run: Run, speed: bool = True) -> np.ndarray:
         run: the result of `train`.
         speed: also plot the steps per second, the only curve that differs between two runs of the same seed.
     """
+    check_instance("run", run, Run, "the result of train")
     return plot_history(run.history, run.config, speed)
 
 
 def plot_history(history: Mapping[str, Sequence[float]], config: Config, speed: bool = True) -> np.ndarray:
     """Plots a run as `plot_run` does, from `run.history` alone or from the columns of a log file."""
+    speed = check_flag("speed", speed)
     columns = {name: np.asarray(values, np.float64) for name, values in history.items()}
     num_rows, num_columns = (2, 2) if speed else (1, 3)
     figure = plt.figure(figsize=(10, 3.5 + 2.75 * num_rows), layout="constrained")
@@ -94,11 +104,14 @@ def plot_study(
         published: an episode to mark: how many one published run needed, such as the original's 293. None marks
             nothing.
     """
+    check_instance("study", study, Study, "a Study")
+    if published is not None:
+        published = check_number("published", published, at_least=0)
     if not study.outcomes or study.config.num_episodes < study.config.solved_window:
         raise ValueError(f"study must have seeds with at least solved_window episodes each, got {study}")
     if axes is None:
         _, axes = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained")
-    curves, distribution, shares = axes
+    curves, distribution, shares = _three(axes)
     window, config = study.config.solved_window, study.config
     solved = np.sort(study.solved_at[np.isfinite(study.solved_at)])
     num_seeds, num_unsolved = len(study.outcomes), len(study.outcomes) - len(solved)
@@ -139,3 +152,12 @@ def plot_study(
             ax.axvline(published, color="tab:orange", linestyle="--", label=f"the one published run ({published:g})")
     distribution.legend(loc="upper right")
     return np.asarray(axes)
+
+
+def _three(axes: Any) -> Sequence[Axes]:
+    three = check_sequence("axes", axes, "three Axes of Matplotlib")
+    if len(three) != 3:
+        raise ValueError(f"axes must be three Axes of Matplotlib, got {shown(axes)}")
+    for i, ax in enumerate(three):
+        check_instance(f"axes[{i}]", ax, Axes, "an Axes of Matplotlib")
+    return three

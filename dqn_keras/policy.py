@@ -1,7 +1,10 @@
 """The epsilon-greedy policy, and the decay of epsilon from episode to episode."""
 
+from typing import Any
+
 import numpy as np
 
+from dqn_keras.checks.numbers import check_array, check_instance, check_number, check_rng, shown
 from dqn_keras.config import Config
 
 
@@ -9,20 +12,39 @@ def action(q_values: np.ndarray, epsilon: float, rng: np.random.Generator) -> in
     """Chooses a random action with probability `epsilon`, else the action with the highest Q-value.
 
     Args:
-        q_values: Q(s, .) of one state, [A] or [1, A]; an array or a tensor.
+        q_values: Q(s, .) of one state, [A] or [1, A], none of them NaN; an array or a tensor.
         epsilon: probability of a random action, in [0, 1].
         rng: the random generator. One draw, `random()`, decides; a random action takes a second draw, `integers(A)`.
 
     Returns:
         The action's index, 0 <= a < A. If several Q-values are highest, it is the first of them.
+
+    Raises:
+        TypeError, ValueError: an argument is wrong; the message names it.
     """
-    if q_values.shape[:-1] not in ((), (1,)):
-        raise ValueError(f"q_values must be those of one state, [A] or [1, A], got shape {q_values.shape}")
+    check_rng(rng)
+    return epsilon_greedy(_one_states(q_values), check_number("epsilon", epsilon, at_least=0, at_most=1), rng)
+
+
+def epsilon_greedy(q_values: np.ndarray, epsilon: float, rng: np.random.Generator) -> int:
+    """Does what `action` does, without checks: for training, where it runs at every step."""
     if rng.random() < epsilon:
         return int(rng.integers(q_values.shape[-1]))
-    return int(np.asarray(q_values).argmax())
+    return int(q_values.argmax())
+
+
+def _one_states(q_values: Any) -> np.ndarray:
+    """Returns the Q-values of one state as an array [A]."""
+    array = check_array("q_values", q_values)
+    if array.shape not in ((array.size,), (1, array.size)) or not array.size:
+        raise ValueError(f"q_values must be those of one state, [A] or [1, A], got shape {array.shape}")
+    if np.isnan(array).any():
+        raise ValueError(f"q_values must not be NaN, got {shown(q_values)}")
+    return array.reshape(-1)
 
 
 def decay_epsilon(epsilon: float, config: Config) -> float:
     """Returns epsilon for the next episode: `epsilon` times `decay`, but not below `epsilon_min`."""
+    epsilon = check_number("epsilon", epsilon, at_least=0, at_most=1)
+    check_instance("config", config, Config, "a Config")
     return max(epsilon * config.decay, config.epsilon_min)

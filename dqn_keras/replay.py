@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dqn_keras._engine.tensorflow import tf
-from dqn_keras.checks.numbers import check_count, check_counts
+from dqn_keras.checks.numbers import check_count, check_counts, check_rng, shown
+from dqn_keras.checks.transitions import check_transition
 
 
 class Experience(NamedTuple):
@@ -32,8 +33,8 @@ class Experience(NamedTuple):
 class ReplayMemory:
     """The last `memory_size` transitions, in a ring buffer that is allocated once.
 
-    The loop of Gymnasium's environments uses `append` and `sample_rows`. Compiled episodes write and draw the same rows
-    inside their program (`loops/compiled.py`).
+    The loop of Gymnasium's environments uses `append_unchecked` and `sample_rows`. Compiled episodes write and draw the
+    same rows inside their program (`loops/compiled.py`).
 
     One transition is one row: state, next_state, then action, reward and terminal_state as float32. So a batch is drawn
     and passed to TensorFlow as one array. float32 holds an action's index exactly up to 2^24.
@@ -49,8 +50,8 @@ class ReplayMemory:
             check_count("memory_size", memory_size),
             check_counts("state_shape", state_shape),
         )
-        if dtype not in (np.float32, np.uint8):
-            raise ValueError(f"dtype must be float32 or uint8, got {dtype!r}")
+        if not isinstance(dtype, type | np.dtype) or dtype not in (np.float32, np.uint8):
+            raise ValueError(f"dtype must be float32 or uint8, got {shown(dtype)}")
         size = math.prod(self.state_shape)
         self.rows = np.zeros((memory_size, 2 * size + 12 // np.dtype(dtype).itemsize), dtype)
         self._states = self.rows[:, :size].reshape(memory_size, *self.state_shape)
@@ -65,8 +66,14 @@ class ReplayMemory:
     def append(self, experience: Experience) -> None:
         """Stores a copy of one transition; when the memory is full, it replaces the oldest.
 
-        It checks nothing, because it runs in the innermost loop; `train` checks what the environment returns.
+        Raises:
+            TypeError, ValueError: a field is wrong; the message names it.
         """
+        fields = check_transition(experience, self.state_shape, self.rows.dtype)
+        self.append_unchecked(Experience(*fields))
+
+    def append_unchecked(self, experience: Experience) -> None:
+        """Does what `append` does, without checks: for training, which checks what the environment returns."""
         i = self.num_appended % len(self.rows)
         scalars = self._scalars[i]
         self._states[i], scalars[0], scalars[1], self._next_states[i], scalars[2] = experience
@@ -75,10 +82,17 @@ class ReplayMemory:
     def sample_rows(self, batch_size: int, rng: np.random.Generator) -> np.ndarray:
         """Returns a uniformly random batch without repeats, as rows; one `rng.choice` draws it.
 
-        Index 0 is the oldest transition in the memory, as in a deque. Raises ValueError if the memory holds fewer than
-        `batch_size`.
+        Index 0 is the oldest transition in the memory, as in a deque.
+
+        Raises:
+            TypeError: `batch_size` is not a whole number, or `rng` is not a NumPy generator.
+            ValueError: the memory holds fewer transitions than `batch_size`.
         """
-        indices = rng.choice(len(self), batch_size, replace=False)  # [B]
+        check_rng(rng)
+        num_kept = len(self)
+        if check_count("batch_size", batch_size) > num_kept:
+            raise ValueError(f"batch_size must be at most {num_kept}, as many as are in the memory, got {batch_size}")
+        indices = rng.choice(num_kept, batch_size, replace=False)  # [B]
         if self.num_appended > len(self.rows):
             indices = (indices + self.num_appended) % len(self.rows)
         return self.rows.take(indices, axis=0)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
+from dqn_keras.checks.numbers import check_instance
 from dqn_keras.study import Study
 
 
@@ -36,8 +37,7 @@ class Summary(NamedTuple):
 
 def summarize(study: Study) -> Summary:
     """Returns the share of seeds solved, and the median and interquartile mean of the episodes to solved."""
-    if not study.outcomes:
-        raise ValueError("study must have at least one seed, got none")
+    _check_study("study", study)
     episodes, num_solved = study.episodes_to_solved, int(np.isfinite(study.solved_at).sum())
     share = scipy.stats.binomtest(num_solved, len(episodes)).proportion_ci(method="wilson")
     return Summary(
@@ -59,8 +59,16 @@ class Comparison(NamedTuple):
 
 def compare(first: Study, second: Study) -> Comparison:
     """Compares the episodes that two configurations need until they are solved; bootstrap intervals."""
+    _check_study("first", first)
+    _check_study("second", second)
     samples = first.episodes_to_solved, second.episodes_to_solved
     return Comparison(_bootstrap(_difference, *samples), _bootstrap(_probability_of_improvement, *samples))
+
+
+def _check_study(name: str, study: Study) -> None:
+    check_instance(name, study, Study, "a Study")
+    if not study.outcomes:
+        raise ValueError(f"{name} must have at least one seed, got none")
 
 
 def _difference(first: np.ndarray, second: np.ndarray, axis: int = -1) -> np.ndarray:

@@ -28,8 +28,8 @@ from dqn_keras._engine.libraries import is_of_a_library
 from dqn_keras._engine.programs import shared_in
 from dqn_keras._engine.recycling import recycle
 from dqn_keras._engine.tensorflow import tf
-from dqn_keras.checks.numbers import check_count
-from dqn_keras.checks.run import check_arguments
+from dqn_keras.checks.numbers import check_count, check_path, shown
+from dqn_keras.checks.run import check_arguments, check_seeds
 from dqn_keras.config import Config
 from dqn_keras.interruption import TrainingInterrupted
 from dqn_keras.progress import tqdm
@@ -128,14 +128,13 @@ def study(
         OSError: `file` cannot be written.
     """
     check_arguments(env, config, verbose)
-    seeds = [check_count("seeds", seed, at_least=0) for seed in seeds]
-    if len(set(seeds)) < len(seeds):
-        raise ValueError(f"seeds must name each seed once, got {seeds}")
-    if engine not in _ENGINES:
-        raise ValueError(f"engine must be one of {', '.join(_ENGINES)}, got {engine!r}")
+    seeds = check_seeds(seeds)
+    if not isinstance(engine, str) or engine not in _ENGINES:
+        raise ValueError(f"engine must be one of {', '.join(_ENGINES)}, got {shown(engine)}")
     num_workers = cpu_count() if num_workers is None else check_count("num_workers", num_workers)
+    path = None if file is None else check_path("file", file)
     interrupted = False
-    with _kept_in(file, seeds, env, config) as (outcomes, save_when_due):
+    with _kept_in(path, seeds, env, config) as (outcomes, save_when_due):
         missing = [seed for seed in seeds if seed not in outcomes]
         bar = tqdm(total=len(seeds), initial=len(seeds) - len(missing), unit="seed", disable=not verbose)
         with bar, contextlib.closing(_ENGINES[engine](_pickled_env(env), config, missing, num_workers)) as results:
@@ -298,17 +297,17 @@ _ENGINES = {"joblib": _by_joblib, "ray": _by_ray}
 
 @contextlib.contextmanager
 def _kept_in(
-    file: str | os.PathLike | None, seeds: Sequence[int], env: gym.Env | FuncEnv, config: Config
+    path: Path | None, seeds: Sequence[int], env: gym.Env | FuncEnv, config: Config
 ) -> Iterator[tuple[dict[int, Outcome], Callable[[], None]]]:
     """Yields the outcomes in a study's file, by seed, and a function that saves them when it is time; saves at the end.
 
     Nobody else can write the file meanwhile. If it cannot be written, that is an error at the start, and a warning
     later.
     """
-    if file is None:
+    if path is None:
         yield {}, lambda: None
         return
-    path, facts = Path(file), {"format": FORMAT, **identity_of_study(env, config)}
+    facts = {"format": FORMAT, **identity_of_study(env, config)}
     with locked(path.with_name(f".{path.name}.lock"), f"file {path}"):
         outcomes = _load(path, facts)
         if any(seed not in outcomes for seed in seeds):
@@ -347,13 +346,13 @@ def _load(path: Path, facts: dict[str, Any]) -> dict[int, Outcome]:
     """Returns the outcomes by seed; none if there is no file yet."""
     if not path.exists():
         return {}
-    outcomes, theirs = _read(path)
+    outcomes, theirs = _read("file", path)
     check_is_same(path, theirs, facts)
     warn_of_other_versions(path, theirs, facts, stacklevel=4)
     return outcomes
 
 
-def _read(path: Path) -> tuple[dict[int, Outcome], dict[str, Any]]:
+def _read(argument: str, path: Path) -> tuple[dict[int, Outcome], dict[str, Any]]:
     """Returns the outcomes by seed, and the facts of the study; nothing in the file is taken on trust."""
     try:
         columns, facts = from_bytes(path.read_bytes())
@@ -366,7 +365,7 @@ def _read(path: Path) -> tuple[dict[int, Outcome], dict[str, Any]]:
             outcomes[seed] = Outcome(seed, rewards, steps, solved_at, bytes.fromhex(digest))
             _check_outcome(outcomes[seed], config)
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"file {path} is not a study that can be loaded: {error}") from error
+        raise ValueError(f"{argument} {path} is not a study that can be loaded: {error}") from error
     return outcomes, facts
 
 
@@ -398,5 +397,5 @@ def load_study(path: str | os.PathLike) -> Study:
         FileNotFoundError: the file does not exist.
         ValueError: the file is damaged, or something in it cannot be from a study; the message names the file.
     """
-    outcomes, facts = _read(Path(path))
+    outcomes, facts = _read("path", check_path("path", path))
     return Study(_config(facts), list(outcomes.values()))

@@ -17,9 +17,8 @@ from dqn_keras.agent import Agent, keeps_averages, make_agent, optimizer_shown, 
 from dqn_keras.callbacks import Listeners
 from dqn_keras.checks.environments import CheckedEnv, Spaces, check_environment, env_name, some_states
 from dqn_keras.checks.formulas import Formulas
-from dqn_keras.checks.numbers import check_count
 from dqn_keras.checks.observations import Watch
-from dqn_keras.checks.run import check_arguments, check_callbacks, check_own_parts
+from dqn_keras.checks.run import check_arguments, check_callbacks, check_checkpoint, check_own_parts
 from dqn_keras.config import Config
 from dqn_keras.interruption import TrainingInterrupted, stop_requests
 from dqn_keras.learn import td_targets
@@ -154,9 +153,8 @@ def train(
             diverged.
     """
     check_arguments(env, config, verbose)
-    callbacks, checkpoint_every = check_callbacks(callbacks), check_count("checkpoint_every", checkpoint_every)
-    if resume and checkpoint is None:
-        raise ValueError("resume needs a folder to resume from: checkpoint, got None")
+    callbacks = check_callbacks(callbacks)
+    checkpoint_every = check_checkpoint(checkpoint, checkpoint_every, resume)
     spaces = check_environment(env, q_network)
     formulas = check_own_parts(config, q_network, optimizer, targets, loss)
     some = some_states(env.observation_space, spaces.state_dtype)

@@ -44,6 +44,7 @@ from dqn_keras import (
 from dqn_keras.environments import CartPole
 from dqn_keras.learn import gradient_step
 from dqn_keras.loops import gymnasium
+from dqn_keras.policy import epsilon_greedy
 
 
 def measured_speed():
@@ -198,9 +199,11 @@ print("loss of steps 0, 100, 200, 299:", np.round([losses[i] for i in (0, 100, 2
 # $\varepsilon$ the action is random. $\varepsilon$ starts at 1, when $Q$ knows nothing, and falls after each episode:
 #
 # $$\varepsilon \leftarrow \max(0.995 \, \varepsilon,\; 0.1)$$
+#
+# `action` checks its arguments, `epsilon_greedy` chooses.
 
 # %%
-source(action, decay_epsilon)
+source(action, epsilon_greedy, decay_epsilon)
 
 # %% [markdown]
 # ## The replay memory

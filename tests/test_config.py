@@ -1,10 +1,16 @@
+import copy
 import dataclasses
+import inspect
+import pickle
+import re
+from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given
 
 from dqn_keras import Config
+from dqn_keras.checks.fields import _OTHER_NAMES
 from tests.helpers.bad_configs import SHARES, bad_fields, bad_hidden_units, refused
 
 ZERO_IS_FINE = ["gamma", "epsilon", "epsilon_min"]
@@ -80,6 +86,36 @@ def test_numpy_scalars_become_pythons():
     ]
 
 
-def test_config_cannot_be_changed():
-    with pytest.raises(dataclasses.FrozenInstanceError):
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("learning_rate", "Config has no field learning_rate; the learning rate is alpha"),
+        ("lr", "Config has no field lr; the learning rate is alpha"),
+        ("buffer_size", "Config has no field buffer_size; the size of the replay memory is memory_size"),
+        ("batchsize", "Config has no field batchsize; did you mean batch_size?"),
+        ("xyz", "Config has no field xyz"),
+    ],
+)
+def test_an_unknown_field_is_an_error_that_hints_at_the_right_one(name, message):
+    for make in (Config, partial(dataclasses.replace, Config())):
+        with pytest.raises(TypeError, match=f"^{re.escape(message)}$"):
+            make(**{name: 1})
+
+
+def test_every_hint_is_a_field():
+    assert {name for _, name in _OTHER_NAMES.values()} <= {field.name for field in dataclasses.fields(Config)}
+
+
+def test_an_assignment_is_an_error_that_says_how_to_make_a_changed_copy():
+    message = "Config is frozen; dataclasses.replace(config, gamma=0.5) makes a changed copy"
+    with pytest.raises(dataclasses.FrozenInstanceError, match=f"^{re.escape(message)}$"):
         Config().gamma = 0.5
+    with pytest.raises(dataclasses.FrozenInstanceError, match="the learning rate is alpha"):
+        Config().learning_rate = 0.5
+
+
+def test_a_config_is_copied_and_pickled_and_shows_its_fields():
+    config = Config(gamma=0.5)
+    for other in (copy.copy(config), pickle.loads(pickle.dumps(config)), dataclasses.replace(config)):
+        assert other == config
+    assert list(inspect.signature(Config).parameters) == [field.name for field in dataclasses.fields(Config)]

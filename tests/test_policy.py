@@ -5,10 +5,11 @@ import tensorflow as tf
 from dqn_keras import Config, action, decay_epsilon
 
 
-class Tape:
+class Tape(np.random.Generator):
     """A generator that gives what it is told, and writes down what it was asked."""
 
     def __init__(self, uniform, integer):
+        super().__init__(np.random.PCG64())
         self.uniform, self.integer, self.calls = uniform, integer, []
 
     def random(self):

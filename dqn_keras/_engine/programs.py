@@ -24,7 +24,7 @@ from dqn_keras._engine.private import (
     traced,
 )
 from dqn_keras._engine.tensorflow import keras, require_xla, tf
-from dqn_keras.checks.networks import check_optimizer
+from dqn_keras.checks.networks import check_optimizer, check_pair
 from dqn_keras.networks import make_q_network
 
 
@@ -44,11 +44,7 @@ class Learner(NamedTuple):
         """Checks that the three belong together, and builds the optimizer."""
         q_network, q_hat_network, optimizer = self
         check_optimizer(optimizer)
-        if q_network is q_hat_network:
-            raise ValueError("q_hat_network must be a second network, got q_network itself")
-        shapes, hat_shapes = ([tuple(w.shape) for w in n.weights] for n in (q_network, q_hat_network))
-        if shapes != hat_shapes:
-            raise ValueError(f"q_hat_network must have weights of q_network's shapes {shapes}, got {hat_shapes}")
+        check_pair(q_network, q_hat_network)
         if not q_network.trainable_variables:
             raise ValueError("q_network must have weights that can be trained, got none")
         if not optimizer.built:
@@ -56,8 +52,8 @@ class Learner(NamedTuple):
             optimizer.build(q_network.trainable_variables)
         if not is_built_for(optimizer, q_network.trainable_variables):
             raise ValueError(
-                f"optimizer must be a new one, or one that was built for this q_network; {optimizer.name!r} was built "
-                "for other variables"
+                f"optimizer must be a new one, or one that was built for this q_network, got {optimizer.name!r}, which "
+                "was built for other variables"
             )
 
     def sizes(self) -> tuple[int, ...] | None:

@@ -72,7 +72,7 @@ def compiled_step(
 
 def _is_the_same(a: Any, b: Any) -> bool:
     """Returns whether two parts are one object; methods, strings and numbers are compared by value."""
-    return a is b or (isinstance(a, str | MethodType | int) and a == b)
+    return a is b or (isinstance(a, str | MethodType | int) and type(a) is type(b) and a == b)
 
 
 def _bind(

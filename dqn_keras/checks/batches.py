@@ -8,7 +8,7 @@ import numpy as np
 
 from dqn_keras._engine.tensorflow import keras, tf
 from dqn_keras.checks.networks import check_network
-from dqn_keras.checks.numbers import check_number
+from dqn_keras.checks.numbers import check_number, shown, unwrapped
 from dqn_keras.replay import Experience
 
 
@@ -21,14 +21,15 @@ def as_batch(experiences: Sequence[Any], state_shape: tuple[int, ...], num_actio
     Raises:
         ValueError: a field's shape, dtype or value is wrong; the message names the field.
     """
-    if len(experiences) != len(_PLURALS):
-        raise ValueError(f"experiences must be the five fields {', '.join(_PLURALS)}, got {len(experiences)}")
+    if not isinstance(experiences, list | tuple) or len(experiences) != len(_PLURALS):
+        got = len(experiences) if isinstance(experiences, list | tuple) else shown(experiences)
+        raise ValueError(f"experiences must be the five fields {', '.join(_PLURALS)}, got {got}")
     fields = []
     for name, field in zip(_PLURALS, experiences, strict=True):
         try:
-            fields.append(field if tf.is_tensor(field) else np.asarray(field))
-        except ValueError as error:
-            raise ValueError(f"{name} must be an array: {error}") from None
+            fields.append(field if isinstance(field, tf.Tensor | tf.Variable) else np.asarray(field))
+        except Exception as error:  # lists of unequal lengths, or an object of any library
+            raise ValueError(f"{name} must be an array, got {shown(field)}") from error
     num_transitions = fields[0].shape[0] if len(fields[0].shape) else None
     if num_transitions == 0:
         raise ValueError("states must hold at least one transition, got none")
@@ -41,9 +42,14 @@ def _checked(name: str, field: Any, shape: list, num_actions: int) -> tf.Tensor:
     got = tf.TensorShape(field.shape)
     if got.rank != len(shape) or not got.is_compatible_with(shape):
         raise ValueError(f"{name} must have shape {shape}, got {got}")
-    dtype = tf.as_dtype(field.dtype) if field.dtype != object else tf.string
+    try:
+        dtype = tf.as_dtype(field.dtype)
+    except TypeError:  # for example, dates
+        dtype = tf.string
     if not (dtype.is_integer or (name != "actions" and (dtype.is_floating or dtype.is_bool))):
-        raise ValueError(f"{name} must be {'whole numbers' if name == 'actions' else 'numbers'}, got {dtype.name}")
+        raise ValueError(
+            f"{name} must be {'whole numbers' if name == 'actions' else 'numbers'}, got {field.dtype.name}"
+        )
     if not tf.is_tensor(field) or (tf.executing_eagerly() and hasattr(field, "numpy")):
         field = np.asarray(field)
         if name == "actions" and not (field.min() >= 0 and field.max() < num_actions):  # XLA would clamp it
@@ -59,10 +65,11 @@ def _checked(name: str, field: Any, shape: list, num_actions: int) -> tf.Tensor:
 
 def as_share(name: str, value: Any) -> tf.Tensor:
     """Returns a number in [0, 1] as a float32 scalar."""
-    if not tf.is_tensor(value) or (tf.executing_eagerly() and hasattr(value, "numpy")):
-        value = check_number(name, np.asarray(value)[()], at_least=0, at_most=1)
-    elif value.shape.rank != 0:
-        raise ValueError(f"{name} must be a scalar, got shape {value.shape}")
+    is_tensor = isinstance(value, tf.Tensor | tf.Variable)
+    if not is_tensor or (tf.executing_eagerly() and hasattr(value, "numpy")):
+        value = check_number(name, unwrapped(value), at_least=0, at_most=1)
+    elif value.shape.rank != 0 or not (value.dtype.is_floating or value.dtype.is_integer):
+        raise ValueError(f"{name} must be a scalar number, got {value.dtype.name} of shape {value.shape}")
     return tf.cast(value, tf.float32)
 
 
@@ -78,6 +85,9 @@ def takes_a_batch(formula: Callable) -> Callable:
     ) -> tf.Tensor:
         check_network("q_network", q_network)
         check_network("q_hat_network", q_hat_network)
+        shapes, hat_shapes = ((n.input_shape, n.output_shape) for n in (q_network, q_hat_network))
+        if shapes != hat_shapes:
+            raise ValueError(f"q_hat_network must have q_network's input and output {shapes}, got {hat_shapes}")
         batch = as_batch(experiences, q_network.input_shape[1:], q_network.output_shape[-1])
         return formula(batch, as_share("gamma", gamma), q_network, q_hat_network)
 

@@ -10,7 +10,8 @@ from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras._engine.tensorflow import keras, require_xla, tf
 from dqn_keras.checks.networks import check_fits
-from dqn_keras.checks.observations import Watch, as_float, as_numbers, feature_name, shown
+from dqn_keras.checks.numbers import shown
+from dqn_keras.checks.observations import Watch, as_float, as_numbers, feature_name
 from dqn_keras.environments import key_of_twin
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from dqn_keras._engine.private import all_layers
 from dqn_keras._engine.tensorflow import keras, tf
+from dqn_keras.checks.numbers import shown
 
 
 def check_network(name: str, network: keras.Model) -> None:
@@ -16,9 +17,9 @@ def check_network(name: str, network: keras.Model) -> None:
     It must be a built Sequential or functional model.
     """
     if not isinstance(network, keras.Sequential | keras.models.Model):
-        raise TypeError(f"{name} must be a Keras model, got {network!r}")
+        raise TypeError(f"{name} must be a Keras model, got {shown(network)}")
     if not network.built or not hasattr(network, "input_shape"):
-        raise ValueError(f"{name} must be a Sequential or functional model with an Input layer")
+        raise ValueError(f"{name} must be a Sequential or functional model with an Input layer, got {shown(network)}")
     for kind, tensors in ("input", network.inputs), ("output", network.outputs):
         if len(tensors) != 1:
             raise ValueError(f"{name} must have one {kind}, got {len(tensors)}")
@@ -29,6 +30,17 @@ def check_network(name: str, network: keras.Model) -> None:
         raise ValueError(f"{name} must give Q-values of shape [B, A], got output {got}")
     if output.dtype != "float32":
         raise ValueError(f"{name} must give float32 values, got {output.dtype}")
+
+
+def check_pair(q_network: keras.Model, q_hat_network: keras.Model) -> None:
+    """Raises TypeError or ValueError unless the two are different networks with weights of the same shapes."""
+    check_network("q_network", q_network)
+    check_network("q_hat_network", q_hat_network)
+    if q_network is q_hat_network:
+        raise ValueError("q_hat_network must be a second network, got q_network itself")
+    shapes, hat_shapes = ([tuple(w.shape) for w in n.weights] for n in (q_network, q_hat_network))
+    if shapes != hat_shapes:
+        raise ValueError(f"q_hat_network must have weights of q_network's shapes {shapes}, got {hat_shapes}")
 
 
 def check_fits(q_network: keras.Model, state_shape: tuple[int, ...], num_actions: int) -> None:
@@ -52,7 +64,9 @@ def _without_batch(shape: Any) -> Any:
 def check_optimizer(optimizer: Any) -> None:
     """Raises TypeError if `optimizer` is not a Keras optimizer."""
     if not isinstance(optimizer, keras.Optimizer):
-        raise TypeError(f"optimizer must be a Keras optimizer such as keras.optimizers.Adam(1e-3), got {optimizer!r}")
+        raise TypeError(
+            f"optimizer must be a Keras optimizer such as keras.optimizers.Adam(1e-3), got {shown(optimizer)}"
+        )
 
 
 def warn_of_inference_mode(network: keras.Model) -> None:

@@ -40,19 +40,6 @@ def as_float(value: Any) -> float | None:
 _NUMBERS = frozenset({float, int, bool, np.float64, np.float32, np.int64, np.int32})
 
 
-def shown(value: Any) -> str:
-    """Returns the repr of a value on one line, without the middle of what is long."""
-    with np.printoptions(threshold=20, edgeitems=2):
-        text = " ".join(repr(value).split())
-    if len(text) <= _LONGEST:
-        return text
-    shape = f" of shape {value.shape}" if isinstance(value, np.ndarray) else ""
-    return f"{text[: _LONGEST - 50]} ... {text[-20:]} ({type(value).__name__}{shape})"
-
-
-_LONGEST = 200
-
-
 def feature_name(state_shape: tuple[int, ...], i: int) -> str:
     """Returns the words for entry `i` of a flat state: feature 3, or feature (0, 3) if states have several axes."""
     index = tuple(map(int, np.unravel_index(i, state_shape)))

@@ -1,10 +1,14 @@
 """Checks of the arguments of `train` and `study`."""
 
 import math
+import os
 import warnings
 from collections.abc import Callable, Sequence
+from numbers import Integral
+from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras._engine.private import arguments_of_compile
@@ -13,6 +17,7 @@ from dqn_keras.agent import owners_optimizer
 from dqn_keras.checks.environments import no_env
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.checks.networks import check_optimizer, warn_of_inference_mode
+from dqn_keras.checks.numbers import check_count, check_flag, check_instance, check_path, check_sequence, shown
 from dqn_keras.config import Config
 
 
@@ -20,10 +25,9 @@ def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> Non
     """Raises TypeError or ValueError that names the wrong argument, if there is one."""
     if not isinstance(env, gym.Env | FuncEnv):
         raise TypeError(f"env must be a gymnasium.Env or a FuncEnv, got {no_env(env)}")
-    if not isinstance(config, Config):
-        raise TypeError(f"config must be a Config, got {config!r}")
-    if verbose not in (0, 1, 2):
-        raise ValueError(f"verbose must be 0, 1 or 2, got {verbose!r}")
+    check_instance("config", config, Config, "a Config")
+    if not isinstance(verbose, Integral | np.bool_) or verbose not in (0, 1, 2):
+        raise ValueError(f"verbose must be 0, 1 or 2, got {shown(verbose)}")
     if isinstance(env, FuncEnv) and not config.jit_compile:
         raise ValueError("jit_compile must be True for a functional environment, got False: its loop needs XLA")
 
@@ -31,12 +35,30 @@ def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> Non
 def check_callbacks(
     callbacks: keras.callbacks.Callback | Sequence[keras.callbacks.Callback] | None,
 ) -> list[keras.callbacks.Callback]:
-    """Returns one or several callbacks as a list; raises TypeError if one is not a Keras callback."""
-    callbacks = [callbacks] if isinstance(callbacks, keras.callbacks.Callback) else list(callbacks or ())
+    """Returns no, one or several callbacks as a list; raises TypeError if one is not a Keras callback."""
+    if callbacks is None or isinstance(callbacks, keras.callbacks.Callback):
+        return [] if callbacks is None else [callbacks]
+    check_instance("callbacks", callbacks, list | tuple, "a Keras callback or a list of them")
     for callback in callbacks:
-        if not isinstance(callback, keras.callbacks.Callback):
-            raise TypeError(f"callbacks must be Keras callbacks, got {callback!r}")
-    return callbacks
+        check_instance("callbacks", callback, keras.callbacks.Callback, "Keras callbacks")
+    return list(callbacks)
+
+
+def check_checkpoint(checkpoint: str | os.PathLike | None, checkpoint_every: int, resume: bool) -> int:
+    """Returns `checkpoint_every` as an int; raises TypeError or ValueError that names the wrong argument."""
+    if checkpoint is not None:
+        check_path("checkpoint", checkpoint)
+    if check_flag("resume", resume) and checkpoint is None:
+        raise ValueError("resume needs a folder to resume from: checkpoint, got None")
+    return check_count("checkpoint_every", checkpoint_every)
+
+
+def check_seeds(seeds: Any) -> list[int]:
+    """Returns the seeds of a study as a list; raises TypeError or ValueError if one is wrong, or there twice."""
+    checked = [check_count("seeds", seed, at_least=0) for seed in check_sequence("seeds", seeds, "whole numbers")]
+    if len(set(checked)) < len(checked):
+        raise ValueError(f"seeds must name each seed once, got {shown(seeds)}")
+    return checked
 
 
 def check_own_parts(
@@ -56,7 +78,7 @@ def check_own_parts(
     if loss is None and q_network is not None and q_network.compiled:
         loss = getattr(q_network, "loss", None)
         if isinstance(loss, list | tuple | dict):
-            raise ValueError(f"q_network must be compiled with one loss, got {loss!r}; or give train a loss")
+            raise ValueError(f"q_network must be compiled with one loss, got {shown(loss)}; or give train a loss")
     if owners is not None:
         config_of_compile = arguments_of_compile(q_network)
         ignored = [x for x in _IGNORED if config_of_compile.get(x)]

@@ -21,7 +21,7 @@ from dqn_keras.config import Config
 from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, packages
 from dqn_keras.loops.updates import checked_step, sum_up
 from dqn_keras.metrics import Episode
-from dqn_keras.policy import action, decay_epsilon
+from dqn_keras.policy import decay_epsilon, epsilon_greedy
 from dqn_keras.replay import Experience, unpack
 from dqn_keras.seeding import episode_seed
 
@@ -44,9 +44,9 @@ def _play_episode(env: CheckedEnv, agent: Agent, config: Config, q: "_InNumPy | 
 
     state = env.reset(episode_seed(agent.seed, number), number)
     for t in range(config.max_steps):
-        a = action(q.values(state), epsilon, rng)
+        a = epsilon_greedy(q.values(state), epsilon, rng)
         next_state, reward, terminated, truncated = env.step(a)
-        memory.append(Experience(state, a, reward, next_state, terminated))
+        memory.append_unchecked(Experience(state, a, reward, next_state, terminated))
         total_reward += reward
         max_reward = max(max_reward, reward)
 

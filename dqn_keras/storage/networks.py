@@ -2,7 +2,6 @@
 
 import os
 import zipfile
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from dqn_keras._engine.copies import check_is_equal, finalize_layers, python_random_kept
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.checks.networks import check_network
+from dqn_keras.checks.numbers import check_path
 from dqn_keras.storage.files import replacing
 
 
@@ -20,7 +20,7 @@ def save_q_network(path: str | os.PathLike, q_network: keras.Model) -> None:
         ValueError: `path` does not end in .keras, or the network has a layer of an unregistered class.
         OSError: the file cannot be written.
     """
-    path = Path(path)
+    path = check_path("path", path)
     if path.suffix != ".keras":
         raise ValueError(f"path must end in .keras, got {str(path)!r}")
     try:
@@ -58,7 +58,7 @@ def load_q_network(path: str | os.PathLike) -> keras.Model:
         FileNotFoundError: the file does not exist.
         ValueError: the file is damaged or does not hold a Q-network; the message names the file.
     """
-    path = Path(path)
+    path = check_path("path", path)
     try:
         with zipfile.ZipFile(path) as archive:
             for part in archive.infolist():

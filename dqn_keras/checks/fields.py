@@ -1,0 +1,52 @@
+"""Helpful errors for a name that is not a field of Config, and for an assignment to a field."""
+
+import dataclasses
+import difflib
+import functools
+from typing import Any, TypeVar
+
+from dqn_keras.checks.numbers import shown
+
+T = TypeVar("T")
+
+OTHER_NAMES = {
+    "learning_rate": ("learning rate", "alpha"),
+    "lr": ("learning rate", "alpha"),
+    "discount": ("discount factor", "gamma"),
+    "buffer_size": ("size of the replay memory", "memory_size"),
+    "memory": ("size of the replay memory", "memory_size"),
+    "episodes": ("number of episodes", "num_episodes"),
+    "hidden": ("number of units of each hidden layer", "hidden_units"),
+    "hidden_layers": ("number of units of each hidden layer", "hidden_units"),
+    "epsilon_decay": ("factor that multiplies epsilon", "decay"),
+}
+"""What other libraries call a field, with what it is and its name here."""
+
+
+def hints_at_fields(cls: type[T]) -> type[T]:
+    """Makes a frozen dataclass say what to write instead of an unknown field, and instead of an assignment."""
+    names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    init = cls.__init__
+
+    def hint(name: str) -> str:
+        what, meant = OTHER_NAMES.get(name, ("", ""))
+        close = difflib.get_close_matches(name, names, n=1)
+        end = f"; the {what} is {meant}" if what else f"; did you mean {close[0]}?" if close else ""
+        return f"{cls.__name__} has no field {name}{end}"
+
+    @functools.wraps(init)
+    def __init__(self: T, *values: Any, **fields: Any) -> None:  # noqa: N807
+        for name in fields:
+            if name not in names:
+                raise TypeError(hint(name))
+        init(self, *values, **fields)
+
+    def __setattr__(self: T, name: str, value: Any) -> None:  # noqa: N807
+        if name not in names:
+            raise dataclasses.FrozenInstanceError(hint(name))
+        raise dataclasses.FrozenInstanceError(
+            f"{cls.__name__} is frozen; dataclasses.replace(config, {name}={shown(value)}) makes a changed copy"
+        )
+
+    cls.__init__, cls.__setattr__ = __init__, __setattr__  # type: ignore[method-assign, assignment]
+    return cls
