@@ -30,6 +30,8 @@ from dqn_keras.storage.checkpoint import Checkpoints
 from dqn_keras.storage.identity import identity
 from tests.helpers import faults
 from tests.helpers.bad_configs import bad_fields, refused
+from tests.helpers.fuzz import fuzz
+from tests.helpers.long_runs import long_runs
 
 
 def bad_configs(number: int) -> dict[str, Any]:
@@ -44,6 +46,11 @@ def bad_configs(number: int) -> dict[str, Any]:
 
     refuse()
     return {"bad Configs": sum(tried.values()), "fields": len(tried), "not refused by name": 0}
+
+
+def kills_with_own_parts(folder: str, num_kills: int) -> dict[str, int]:
+    """Kill runs of six cases, ten kills of each run."""
+    return faults.kill_campaign(folder, num_kills, num_kills // 4, cases=tuple(faults.OWN_PARTS))
 
 
 def forgotten() -> dict[str, int]:
@@ -127,6 +134,9 @@ def cost_of_compiled_checks(rounds: int = 30) -> dict[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=120, help="SIGKILLs, a quarter of them inside a save (120)")
+    parser.add_argument("--own-kills", type=int, default=60, help="SIGKILLs of runs with own parts (60)")
+    parser.add_argument("--races", type=int, default=12, help="pairs of processes in one folder (12)")
+    parser.add_argument("--cases", type=int, default=2_500, help="calls of public functions (2,500)")
     parser.add_argument("--signals", type=int, default=24, help="SIGINTs and SIGTERMs (24)")
     parser.add_argument("--corruptions", type=int, default=5_000, help="corrupted checkpoints (5,000)")
     parser.add_argument("--configs", type=int, default=2_000, help="bad Configs (2,000)")
@@ -134,7 +144,8 @@ def main() -> None:
     versions = f"tensorflow {tf.__version__}, keras {keras.__version__}, gymnasium {gym.__version__}"
     print("# Nothing lost, nothing silent\n")
     print(f"`python -m benchmarks.reliability --kills {arguments.kills} --signals {arguments.signals}`")
-    print(f"`--corruptions {arguments.corruptions} --configs {arguments.configs}` (Python {platform.python_version()},")
+    print(f"`--corruptions {arguments.corruptions} --configs {arguments.configs} --own-kills {arguments.own_kills}`")
+    print(f"`--races {arguments.races} --cases {arguments.cases}` (Python {platform.python_version()},")
     print(f"{versions}, numpy {np.__version__}). Every figure that should be 0 is in bold.\n")
     print("| what | figures |\n|---|---|")
 
@@ -150,18 +161,26 @@ def main() -> None:
         "does (weights, target, Adam, memory, random state, rewards, counters) or a file is left over": in_folder(
             faults.kill_campaign, arguments.kills, arguments.kills // 4
         ),
+        "the same with parts of the user's: a convolution, an LSTM, BatchNormalization, a schedule, targets and a loss "
+        "with a variable, in both loops": in_folder(kills_with_own_parts, arguments.own_kills),
         "SIGINT and SIGTERM at random times, then resumed": in_folder(faults.signal_campaign, arguments.signals),
+        "faults of the disk in the middle of a run, then resumed on the mended disk": in_folder(faults.disk_campaign),
+        "two processes that train in one folder at once, or one after the other": in_folder(
+            faults.race_campaign, arguments.races
+        ),
         "each array and fact of a checkpoint taken out, then put back to its start, both loops": forgotten,
         "the newest checkpoint corrupted; silent is what was loaded, not told, or not replaced by the older one": (
             in_folder(faults.corruption_campaign, arguments.corruptions)
         ),
         "Config with a bad field": lambda: bad_configs(arguments.configs),
+        "public functions with a bad argument": lambda: fuzz(arguments.cases),
+        "many short agents, runs and studies in one process": lambda: long_runs(2_000, 500, 200, 20),
         "cost, Gymnasium loop on CartPole-v1": cost_of_checks,
         "cost, compiled episodes": cost_of_compiled_checks,
     }.items():
         start = time.perf_counter()
         figures = campaign()
-        bad = ("differing runs", "not noticed", "silent", "not refused by name")
+        bad = ("differing runs", "not noticed", "silent", "not refused by name", "not one warning", "litter", "foreign")
         cells = []
         for name, value in figures.items():
             if isinstance(value, dict):

@@ -256,6 +256,23 @@ USAGE_ERRORS = {
 }
 
 
+SLIPS = {
+    "trian CartPole-v1": "did you mean `dqn-keras train`?",
+    "train CartPole-v1 --lr 0.1": "the learning rate is --alpha",
+    "train CartPole-v1 --learning-rate 0.1": "the learning rate is --alpha",
+    "train CartPole-v1 --tau 1e-1 --buffer-size 1e5": "the size of the replay memory is --memory-size",
+    "train CartPole-v1 --hidden-units 64,64": "spaces separate the numbers: --hidden-units 64 64",
+    "train CartPole-v1 --gamma 1e0 --num-episodes 1e3": "whole numbers have only digits: --num-episodes 1000",
+    "train CartPole-v1 --batch-size 64.0": "whole numbers have only digits: --batch-size 64",
+}
+
+
+@pytest.mark.parametrize(("line", "hint"), SLIPS.items(), ids=SLIPS)
+def test_a_common_slip_gets_a_hint(line, hint, capfd):
+    assert dqn_keras(line) == 2
+    assert capfd.readouterr().err.endswith(f"╯\ndqn-keras: {hint}\n")
+
+
 @pytest.mark.parametrize(("line", "parts"), USAGE_ERRORS.items(), ids=USAGE_ERRORS)
 def test_an_option_that_cannot_be_read_is_explained(line, parts, capfd):
     assert dqn_keras(line) == 2

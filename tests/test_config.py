@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 
 from dqn_keras import Config
-from dqn_keras.checks.fields import _OTHER_NAMES
+from dqn_keras.checks.fields import OTHER_NAMES
 from tests.helpers.bad_configs import SHARES, bad_fields, bad_hidden_units, refused
 
 ZERO_IS_FINE = ["gamma", "epsilon", "epsilon_min"]
@@ -103,7 +103,7 @@ def test_an_unknown_field_is_an_error_that_hints_at_the_right_one(name, message)
 
 
 def test_every_hint_is_a_field():
-    assert {name for _, name in _OTHER_NAMES.values()} <= {field.name for field in dataclasses.fields(Config)}
+    assert {name for _, name in OTHER_NAMES.values()} <= {field.name for field in dataclasses.fields(Config)}
 
 
 def test_an_assignment_is_an_error_that_says_how_to_make_a_changed_copy():

@@ -4,6 +4,7 @@ TensorFlow and Gymnasium are imported only when a command runs, so that `--help`
 """
 
 import dataclasses
+import difflib
 import importlib
 import os
 import re
@@ -17,6 +18,7 @@ from typing import Annotated, Any, cast
 import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
+from dqn_keras.checks.fields import OTHER_NAMES
 from dqn_keras.config import Config
 from dqn_keras.version import __version__
 
@@ -145,10 +147,36 @@ def parse(arguments: Sequence[str]) -> Any:
     """Returns the command with its options, checked. After the help or an error, tyro raises SystemExit."""
     commands: Any = Train | Resume | Watch | Evaluate | Study | Plot
     description = "Train Deep Q-Networks on Gymnasium's environments."
-    command = tyro.cli(commands, prog="dqn-keras", description=description, args=arguments)
+    try:
+        command = tyro.cli(commands, prog="dqn-keras", description=description, args=arguments)
+    except SystemExit as end:
+        if end.code and (hint := _hint(arguments)):
+            print(f"dqn-keras: {hint}", file=sys.stderr)
+        raise
     if isinstance(command, _Task):
         command.config = cast(Any, Config(**vars(command.config)))
     return command
+
+
+def _hint(arguments: Sequence[str]) -> str | None:
+    """Returns what to write instead of a common slip in arguments that cannot be read."""
+    names = [command.__name__.lower() for command in (Train, Resume, Watch, Evaluate, Study, Plot)]
+    if arguments and arguments[0] not in names:
+        close = difflib.get_close_matches(arguments[0], names, n=1)
+        return f"did you mean `dqn-keras {close[0]}`?" if close else None
+    are_floats = {field.name for field in dataclasses.fields(Config) if field.type is float}
+    for option, value in zip(arguments, [*arguments[1:], ""], strict=True):
+        name = option.removeprefix("--").replace("-", "_")
+        if name == option:
+            continue
+        if name in OTHER_NAMES:
+            what, name_here = OTHER_NAMES[name]
+            return f"the {what} is --{name_here.replace('_', '-')}"
+        if re.fullmatch(r"\(?\d+(,\d+)+\)?", value):
+            return f"spaces separate the numbers: {option} {' '.join(re.findall(r'[0-9]+', value))}"
+        if name not in are_floats and re.fullmatch(r"\d+(\.0*)?(e\+?\d+)?", value) and not value.isdigit():
+            return f"whole numbers have only digits: {option} {float(value):.0f}"
+    return None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,7 +15,7 @@ def refused(name, value):
         Config(**{name: value})
     message = str(caught.value)
     assert message.startswith(name), message
-    assert repr(value) in message, message
+    assert repr(value)[:100] in message, message
 
 
 not_numbers = st.sampled_from([None, "64", b"1", True, False, np.True_, [1], (), {}, 1j, object()])
