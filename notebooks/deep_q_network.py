@@ -43,8 +43,8 @@ from dqn_keras import (
 )
 from dqn_keras.environments import CartPole
 from dqn_keras.learn import gradient_step
-from dqn_keras.policy import epsilon_greedy
 from dqn_keras.loops import gymnasium
+from dqn_keras.policy import epsilon_greedy
 
 
 def measured_speed():
