@@ -32,16 +32,20 @@ def test_right_arguments_are_accepted(name):
         DOORS[name].call(**DOORS[name].arguments())
 
 
+def failures_of(found):
+    return found["foreign"] + found["nonsense"] + found["refused"]
+
+
 def test_a_bad_argument_is_an_error_that_names_it():
     found = fuzz(2_000)
-    assert not (failures := found["foreign"] + found["nonsense"]), "\n".join(failures)
+    assert not (failures := failures_of(found)), "\n".join(failures)
     assert found["clear"] > 1_500
 
 
 @pytest.mark.slow
 def test_each_bad_argument_is_an_error_that_names_it():
     found = fuzz(len(CASES))
-    assert not (failures := found["foreign"] + found["nonsense"]), "\n".join(failures)
+    assert not (failures := failures_of(found)), "\n".join(failures)
     assert found["clear"] + found["accepted"] == len(CASES)
 
 
@@ -60,6 +64,7 @@ def of_another_name(x):
         (naming, "'x'", "clear"),
         (naming, "0.5", "accepted"),
         (naming, "nan", "nonsense"),
+        (naming, "0", "refused"),
         (lambda x: x + 1, "'x'", "foreign"),
         (of_another_name, "'x'", "foreign"),
         (naming, "[0.5] * 100_000", "foreign"),  # the message is 500,000 characters long

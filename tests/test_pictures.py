@@ -1,3 +1,5 @@
+import io
+
 import gymnasium as gym
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -106,6 +108,12 @@ def test_bad_frames_are_refused(frames, tmp_path):
         save_animation([], target)
     with pytest.raises(ValueError, match=r"frames must be \[H, W, 3\] uint8, got \(40, 60\)"):
         save_animation([frame[..., 0] for frame in frames], target)
+    with pytest.raises(ValueError, match=r"^frames must have one size"):
+        save_animation([*frames, frames[0][:20]], target)
+    with pytest.raises(ValueError, match=r"^file must end in .png or .gif if there is no format, got 'square.txt'"):
+        save_animation(frames, "square.txt")
+    with pytest.raises(ValueError, match=r"^file must end in .png or .gif if there is no format, got <_io.BytesIO"):
+        save_animation(frames, io.BytesIO())
     for fps in (0, -5):
         with pytest.raises(ValueError, match=r"^fps must be a whole number"):
             save_animation(frames, target, fps=fps)

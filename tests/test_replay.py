@@ -1,6 +1,7 @@
 from collections import deque
 
 import numpy as np
+import pytest
 import tensorflow as tf
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -74,3 +75,24 @@ def test_rows_unpack_alike_in_numpy_and_tensorflow():
     for array, tensor in zip(unpack(rows, (1,)), unpack(tf.constant(rows), (1,)), strict=True):
         np.testing.assert_array_equal(array, tensor.numpy())
         assert array.dtype == tensor.numpy().dtype
+
+
+def test_a_memory_of_images_takes_only_whole_numbers_that_a_byte_holds():
+    memory = ReplayMemory(2, (2,), np.uint8)
+    memory.append(Experience([0, 255], 0, 1.0, np.zeros(2), 0))
+    for bad in ([0.5, 0], [0, 256], [-1, 0], [np.nan, 0]):
+        with pytest.raises(ValueError, match=r"^state must be whole numbers from 0 to 255"):
+            memory.append(Experience(bad, 0, 1.0, np.zeros(2), 0))
+    assert len(memory) == 1
+
+
+def test_a_batch_larger_than_the_memory_is_refused(rng):
+    with pytest.raises(ValueError, match=r"^batch_size must be at most 3, .* got 4"):
+        filled(8, 3).sample(4, rng)
+
+
+def test_an_action_is_stored_as_the_whole_number_it_is(rng):
+    memory = ReplayMemory(1, (1,))
+    for action in (2, np.int64(2), np.array(2), tf.constant(2)):
+        memory.append(Experience([0.0], action, 0.0, [0.0], False))
+        assert memory.sample(1, rng).action == 2
