@@ -32,7 +32,8 @@ _LONGEST = 200
 
 def check_count(name: str, value: Any, at_least: int = 1) -> int:
     """Returns the whole number `value` as an int; otherwise raises TypeError or ValueError that names it."""
-    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+    # The first test says the same of an int, in a tenth of the time: `sample_rows` runs at every update.
+    is_whole = type(value) is int or (isinstance(value, Integral) and not isinstance(value, bool))
     if is_whole and at_least <= int(value) <= LARGEST_COUNT:
         return int(value)
     message = f"{name} must be a whole number from {at_least} to {LARGEST_COUNT}, got {shown(value)}"
