@@ -8,6 +8,7 @@ import os
 import pickle
 import signal
 import sys
+import tempfile
 import threading
 import time
 import uuid
@@ -241,7 +242,13 @@ def _by_joblib(env_copy: _PickledEnv, config: Config, seeds: list[int], num_work
         return
     backend = parallel_config(backend="loky", inner_max_num_threads=1)
     with backend, _compilation_cache_in_children(), _interrupts_ignored_by_children():
-        parallel = Parallel(n_jobs=min(num_workers, len(seeds)), batch_size=1, return_as="generator_unordered")
+        parallel = Parallel(
+            n_jobs=min(num_workers, len(seeds)),
+            batch_size=1,
+            return_as="generator_unordered",
+            max_nbytes=None,  # arrays are sent as they are; joblib would otherwise leave an empty folder behind
+            temp_folder=tempfile.gettempdir(),
+        )
         results = parallel(delayed(_train_seed_in_worker)(env_copy, config, seed) for seed in seeds)
     yield from results
 

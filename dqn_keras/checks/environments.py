@@ -27,7 +27,7 @@ class CheckedEnv:
         if not isinstance(env, gym.Env):
             raise TypeError(f"env must be a gymnasium.Env, got {no_env(env)}")
         self.name = env_name(env)
-        self.spaces = check_spaces(self.name, env.observation_space, env.action_space)
+        self.spaces = spaces_of(env)
         self._env, self._watch = env, watch
         self._is_uint8 = self.spaces.state_dtype == np.uint8
 
@@ -133,6 +133,18 @@ def some_states(space: Any, dtype: np.dtype, num_states: int = 8) -> np.ndarray:
     return np.where(is_bounded, within, np.clip(normal, low, high)).astype(dtype)
 
 
+def spaces_of(env: gym.Env | FuncEnv) -> Spaces:
+    """Returns the sizes of an environment's spaces; raises ValueError if they are missing or not supported."""
+    name = env_name(env)
+    try:
+        observations, actions = env.observation_space, env.action_space
+    except AttributeError as error:
+        raise ValueError(
+            f"env {name} must have an observation_space and an action_space, got none ({error})"
+        ) from error
+    return check_spaces(name, observations, actions)
+
+
 def check_spaces(name: str, observations: gym.Space, actions: gym.Space) -> Spaces:
     """Returns the sizes of the two spaces; raises ValueError if they are not supported."""
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
@@ -192,7 +204,7 @@ _spaces_of_twins: dict[Hashable, Spaces] = {}
 
 def _check_functions(env: FuncEnv) -> Spaces:
     name = env_name(env)
-    spaces = check_spaces(name, env.observation_space, env.action_space)
+    spaces = spaces_of(env)
     rng = tf.constant([0, 0], tf.int64)
     state = env.initial(rng)
     next_state = env.transition(state, tf.constant(spaces.first_action), rng)

@@ -20,6 +20,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import keras
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -203,6 +204,7 @@ POOL: dict[str, Callable[[], Any]] = {
     "a right network": lambda: networks(1)[0],
     "an environment": lambda: Corridor(3, 3),
     "an environment's class": lambda: CartPole,
+    "an environment without spaces": gym.Env,
     "a functional environment": lambda: CartPole(),
     "an environment's name": lambda: "CartPole-v1",
     "a Config": lambda: QUICK,

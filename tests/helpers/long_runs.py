@@ -28,17 +28,14 @@ def resident() -> float:
 
 
 def held(folder: Path) -> dict[str, int]:
-    """The number of things other than memory that this process holds; `folder` has its temporary files and its cache.
-
-    Joblib's empty folders in the shared memory, one for each study in workers, stay until the process ends.
-    """
+    """The number of things other than memory that this process holds. `folder` has its temporary files and cache."""
     process, temporary = psutil.Process(), [x for x in folder.iterdir() if x.name != "cache"]
     return {
         "file descriptors": process.num_fds(),
         "threads": process.num_threads(),
         "processes": len(process.children(recursive=True)),
         "temporary files": len(temporary),
-        "files in shared memory": sum(x.is_file() and str(process.pid) in x.name for x in SHARED_MEMORY.iterdir()),
+        "files in shared memory": sum(f"_{process.pid}_" in x.name for x in SHARED_MEMORY.iterdir()),
         "folders of processes in the cache": len(list(folder.glob("cache/*/process-*"))),
     }
 
@@ -85,7 +82,7 @@ def growth(use: Callable[[int], None], number: int) -> float:
     before = resident()
     for seed in range(number):
         use(seed)
-    return resident() - before
+    return round(resident() - before, 1)
 
 
 def long_runs(num_agents: int, num_trains: int, num_studies: int, num_in_workers: int) -> dict[str, float]:
