@@ -109,7 +109,7 @@ def check_path(name: str, value: Any) -> Path:
     if not isinstance(text, str):
         raise TypeError(f"{name} must be a path, as a string or a pathlib.Path, got {shown(value)}")
     if not text or "\0" in text:
-        raise ValueError(f"{name} must be a path of at least one character, none of them NUL, got {shown(value)}")
+        raise ValueError(f"{name} must be a path that is not empty and has no NUL character, got {shown(value)}")
     return Path(text)
 
 
