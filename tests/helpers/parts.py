@@ -161,6 +161,16 @@ INFERENCE_ONLY = {
 }
 
 
+ALL_NETWORKS = NETWORKS | INFERENCE_ONLY
+
+
+def two_of(make_network):
+    """Two networks, made apart, of equal weights."""
+    first, second = make_network(), make_network()
+    second.set_weights(first.get_weights())
+    return first, second
+
+
 def excluding():
     optimizer = keras.optimizers.AdamW(0.01, weight_decay=0.5)
     optimizer.exclude_from_weight_decay(var_names=["bias"])
