@@ -24,11 +24,28 @@ class TrainingInterrupted(KeyboardInterrupt):
         super().__init__(run, folder)
         self.run, self._folder = run, folder
 
+    def __reduce__(self) -> tuple:
+        return KeyboardInterrupt, (str(self),)  # a run that is sent to another process would lose its optimizer's state
+
     def __str__(self) -> str:
         after = f"after {len(self.run.episodes)} episodes"
+        if not self.run.interrupted:
+            return f"{after}, the last of the run; the exception's `run` has them"
         if self._folder is None:
             return f"{after}; the exception's `run` has them (in a notebook: sys.last_value.run)"
         return f"{after}, which are saved in {self._folder}; train(..., resume=True) continues"
+
+
+class _Requests:
+    """A handler that notes the first signal, and raises KeyboardInterrupt at the second."""
+
+    def __init__(self) -> None:
+        self.signals: list[int] = []
+
+    def __call__(self, number: int, _: Any) -> None:
+        self.signals.append(number)
+        if len(self.signals) > 1:
+            raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
@@ -38,20 +55,27 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
     Interrupting a notebook cell is a Ctrl-C. Handlers that other code has set stay in place. Python handles signals in
     the main thread alone, so in another thread the function always returns False.
     """
-    requests: list[int] = []
+    requests = _Requests()
+    with _handled_by(requests, signal.SIGINT, signal.SIGTERM):
+        yield lambda: bool(requests.signals)
 
-    def note(number: int, _: Any) -> None:
-        requests.append(number)
-        if len(requests) > 1:
-            raise KeyboardInterrupt
 
+def sigterm_interrupts() -> contextlib.AbstractContextManager[None]:
+    """Makes SIGTERM raise KeyboardInterrupt in the block, as Ctrl-C does, unless other code handles it."""
+    return _handled_by(signal.default_int_handler, signal.SIGTERM)
+
+
+@contextlib.contextmanager
+def _handled_by(handler: Callable, *numbers: int) -> Iterator[None]:
+    """Sets the handler of these signals, unless other code than `train` has set one; restores it at the end."""
     previous = {}
     if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
-                previous[number] = signal.signal(number, note)
+        for number in numbers:
+            before = signal.getsignal(number)
+            if before in (signal.SIG_DFL, signal.default_int_handler) or isinstance(before, _Requests):
+                previous[number] = signal.signal(number, handler)
     try:
-        yield lambda: bool(requests)
+        yield
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        for number, before in previous.items():
+            signal.signal(number, before)

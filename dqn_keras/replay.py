@@ -51,14 +51,25 @@ class ReplayMemory:
             check_counts("state_shape", state_shape),
         )
         if not isinstance(dtype, type | np.dtype) or dtype not in (np.float32, np.uint8):
-            raise ValueError(f"dtype must be float32 or uint8, got {shown(dtype)}")
+            raise ValueError(f"dtype must be np.float32 or np.uint8, got {shown(dtype)}")
         size = math.prod(self.state_shape)
         self.rows = np.zeros((memory_size, 2 * size + 12 // np.dtype(dtype).itemsize), dtype)
-        self._states = self.rows[:, :size].reshape(memory_size, *self.state_shape)
-        self._next_states = self.rows[:, size : 2 * size].reshape(memory_size, *self.state_shape)
-        self._scalars = self.rows[:, 2 * size :].view(np.float32)  # [memory_size, 3]
         self.num_appended = 0
         """Number of all transitions appended so far; the next one goes to row `num_appended % memory_size`."""
+        self._view_rows()
+
+    def _view_rows(self) -> None:
+        size, shape = math.prod(self.state_shape), (len(self.rows), *self.state_shape)
+        self._states = self.rows[:, :size].reshape(shape)
+        self._next_states = self.rows[:, size : 2 * size].reshape(shape)
+        self._scalars = self.rows[:, 2 * size :].view(np.float32)  # [memory_size, 3]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._view_rows()  # a copy's own rows
 
     def __len__(self) -> int:
         return min(self.num_appended, len(self.rows))

@@ -32,7 +32,7 @@ from dqn_keras._engine.tensorflow import tf
 from dqn_keras.checks.numbers import check_count, check_path, shown
 from dqn_keras.checks.run import check_arguments, check_seeds
 from dqn_keras.config import Config
-from dqn_keras.interruption import TrainingInterrupted
+from dqn_keras.interruption import TrainingInterrupted, sigterm_interrupts
 from dqn_keras.progress import tqdm
 from dqn_keras.storage.files import FORMAT, from_bytes, locked, replacing, to_bytes
 from dqn_keras.storage.identity import check_is_same, identity_of_study
@@ -108,7 +108,7 @@ def study(
 ) -> Study:
     """Trains one agent for each seed, several at once; each run is exactly that of `train(env, config, seed)`.
 
-    Ctrl-C ends the study and returns the finished seeds. Only a study with a `file` can be continued.
+    Ctrl-C or SIGTERM ends the study and returns the finished seeds. Only a study with a `file` can be continued.
 
     Args:
         env: an environment, as for `train`. Each worker process gets its own pickled copy.
@@ -133,12 +133,13 @@ def study(
     if not isinstance(engine, str) or engine not in _ENGINES:
         raise ValueError(f"engine must be one of {', '.join(_ENGINES)}, got {shown(engine)}")
     num_workers = cpu_count() if num_workers is None else check_count("num_workers", num_workers)
-    path = None if file is None else check_path("file", file)
+    path = None if file is None else check_path("file", file).absolute()
     interrupted = False
     with _kept_in(path, seeds, env, config) as (outcomes, save_when_due):
         missing = [seed for seed in seeds if seed not in outcomes]
         bar = tqdm(total=len(seeds), initial=len(seeds) - len(missing), unit="seed", disable=not verbose)
-        with bar, contextlib.closing(_ENGINES[engine](_pickled_env(env), config, missing, num_workers)) as results:
+        trained = _ENGINES[engine](_pickled_env(env), config, missing, num_workers)
+        with bar, contextlib.closing(trained) as results, sigterm_interrupts():
             try:
                 for outcome in results:
                     if outcome is None:  # its run was asked to stop
@@ -314,8 +315,13 @@ def _kept_in(
     if path is None:
         yield {}, lambda: None
         return
+    if path.is_dir():
+        raise ValueError(f"file must be a file, got the folder {path}")
     facts = {"format": FORMAT, **identity_of_study(env, config)}
     with locked(path.with_name(f".{path.name}.lock"), f"file {path}"):
+        for unfinished in path.parent.glob(f".{path.stem}.*.partial{path.suffix}"):  # of processes that have died
+            with contextlib.suppress(OSError):
+                unfinished.unlink()
         outcomes = _load(path, facts)
         if any(seed not in outcomes for seed in seeds):
             try:
@@ -371,7 +377,7 @@ def _read(argument: str, path: Path) -> tuple[dict[int, Outcome], dict[str, Any]
             rewards, steps = columns[f"{seed}/rewards"], columns[f"{seed}/steps"]
             outcomes[seed] = Outcome(seed, rewards, steps, solved_at, bytes.fromhex(digest))
             _check_outcome(outcomes[seed], config)
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, IsADirectoryError) as error:
         raise ValueError(f"{argument} {path} is not a study that can be loaded: {error}") from error
     return outcomes, facts
 

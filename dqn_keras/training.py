@@ -174,8 +174,8 @@ def train(
         episodes_per_call = min(100, checkpoint_every) if checkpoints else 100
         watch = Watch(env_name(env), env.observation_space, is_default_network=q_network is None)
         played = _timed(_episodes(env, spaces, run, formulas, callbacks, episodes_per_call, watch), run)
-        listeners = Listeners(run, callbacks)
         with Progress(run, verbose) as progress, stop_requests() as is_asked_to_stop, optimizer_shown(agent):
+            listeners = Listeners(run, callbacks)
             listeners.begin()
             heard = listeners.heard(played) if callbacks else played
             _play_until_over(run, heard, progress, checkpoints, is_asked_to_stop)

@@ -268,6 +268,21 @@ def test_two_processes_that_start_at_once_leave_one_whole_run(tmp_path):
     assert figures["differing runs"] == 0
 
 
+def test_a_callback_that_changes_the_current_folder_moves_no_checkpoint(tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    play("Gymnasium loop", "run", QUICK, callbacks=[Meanwhile(lambda: os.chdir("elsewhere"))])
+    assert files(tmp_path / "run") == ["checkpoint-0000000035.npz", "checkpoint-0000000040.npz"]
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_a_lock_that_cannot_be_taken_in_a_folder_that_can_be_written_is_an_error(tmp_path):
+    (tmp_path / ".lock").mkdir()  # or a file of another user
+    with pytest.raises(OSError, match=r"^checkpoint .* cannot be locked: "):
+        play("Gymnasium loop", tmp_path, QUICK)
+    assert files(tmp_path) == []
+
+
 def test_only_older_files_of_the_same_run_are_deleted(tmp_path):
     play("Gymnasium loop", tmp_path / "other", QUICK, SEED + 1)
     others = {}

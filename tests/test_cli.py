@@ -263,6 +263,9 @@ SLIPS = {
     "train CartPole-v1 --tau 1e-1 --buffer-size 1e5": "the size of the replay memory is --memory-size",
     "train CartPole-v1 --hidden-units 64,64": "spaces separate the numbers: --hidden-units 64 64",
     "train CartPole-v1 --gamma 1e0 --num-episodes 1e3": "whole numbers have only digits: --num-episodes 1000",
+    "train CartPole-v1 --lr=0.1": "the learning rate is --alpha",
+    "train CartPole-v1 --hidden-units=[64,64]": "spaces separate the numbers: --hidden-units 64 64",
+    "train CartPole-v1 --num-episodes=1e3": "whole numbers have only digits: --num-episodes 1000",
     "train CartPole-v1 --batch-size 64.0": "whole numbers have only digits: --batch-size 64",
 }
 
@@ -279,6 +282,7 @@ def test_an_option_that_cannot_be_read_is_explained(line, parts, capfd):
     out, err = capfd.readouterr()
     assert out == ""
     assert all(part in err for part in parts)
+    assert err.endswith("╯\n")
     assert "__tyro" not in err
     assert not any(Path.cwd().iterdir())
 

@@ -119,3 +119,15 @@ def test_a_config_is_copied_and_pickled_and_shows_its_fields():
     for other in (copy.copy(config), pickle.loads(pickle.dumps(config)), dataclasses.replace(config)):
         assert other == config
     assert list(inspect.signature(Config).parameters) == [field.name for field in dataclasses.fields(Config)]
+
+
+def test_a_subclass_may_have_attributes_of_its_own():
+    class Named(Config):
+        def __init__(self, name, **fields):
+            super().__init__(**fields)
+            self.name = name
+
+    named = Named("a", gamma=0.9)
+    assert (named.name, named.gamma) == ("a", 0.9)
+    with pytest.raises(dataclasses.FrozenInstanceError, match=r"dataclasses\.replace"):
+        named.gamma = 0.5

@@ -1,6 +1,7 @@
 """Ctrl-C and SIGTERM: `train` finishes the episode, saves, and ends whatever is around it, too."""
 
 import dataclasses
+import pickle
 import signal
 import threading
 
@@ -8,6 +9,7 @@ import keras
 import pytest
 
 from dqn_keras import TrainingInterrupted, train
+from dqn_keras.environments import CartPole
 from tests.helpers.faults import CONFIG, LOOPS, SEED, files, play
 from tests.helpers.runs import fingerprint
 
@@ -64,6 +66,8 @@ def test_a_request_in_the_last_episode_is_not_lost_but_the_run_is_whole(cartpole
     run = interrupted(lambda: train(cartpole, config, SEED, verbose=0, callbacks=[Asking(signal.SIGINT)])).run
     assert not run.interrupted
     assert len(run.episodes) == 8
+    error = interrupted(lambda: train(cartpole, config, SEED, verbose=0, callbacks=[Asking(signal.SIGINT)]))
+    assert str(error) == "after 8 episodes, the last of the run; the exception's `run` has them"
 
 
 def test_a_second_ctrl_c_stops_at_once(cartpole):
@@ -71,6 +75,26 @@ def test_a_second_ctrl_c_stops_at_once(cartpole):
         train(cartpole, QUICK, SEED, verbose=0, callbacks=[Asking(signal.SIGINT, signal.SIGINT)])
     assert type(caught.value) is KeyboardInterrupt
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_run_inside_a_callback_is_interrupted_too(cartpole):
+    inner = []
+
+    def train_inside(epoch, logs):
+        inner.append(interrupted(lambda: train(cartpole, QUICK, SEED, verbose=0, callbacks=[Asking(signal.SIGINT)])))
+        raise inner[0]
+
+    outside = keras.callbacks.LambdaCallback(on_epoch_end=train_inside)
+    error = interrupted(lambda: train(CartPole(), QUICK, SEED, verbose=0, callbacks=[outside]))
+    assert error is inner[0]
+    assert len(error.run.episodes) == 8
+
+
+def test_the_exception_can_be_sent_to_another_process_without_its_run(cartpole):
+    error = interrupted(lambda: train(cartpole, QUICK, SEED, verbose=0, callbacks=[Asking(signal.SIGINT)]))
+    sent = pickle.loads(pickle.dumps(error))
+    assert type(sent) is KeyboardInterrupt
+    assert str(sent) == str(error)
 
 
 def test_handlers_of_the_users_own_stay(cartpole):

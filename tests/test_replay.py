@@ -1,3 +1,5 @@
+import copy
+import pickle
 from collections import deque
 
 import numpy as np
@@ -96,3 +98,14 @@ def test_an_action_is_stored_as_the_whole_number_it_is(rng):
     for action in (2, np.int64(2), np.array(2), tf.constant(2)):
         memory.append(Experience([0.0], action, 0.0, [0.0], False))
         assert memory.sample(1, rng).action == 2
+
+
+@pytest.mark.parametrize("make", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_of_a_memory_stores_in_its_own_rows(make):
+    memory = ReplayMemory(3, (2,))
+    memory.append(Experience([1.0, 2.0], 1, 3.0, [4.0, 5.0], False))
+    other = make(memory)
+    other.append(Experience([6.0, 7.0], 0, 8.0, [9.0, 10.0], True))
+    assert (len(memory), len(other)) == (1, 2)
+    np.testing.assert_array_equal(other.rows[1], [6, 7, 9, 10, 0, 8, 1])
+    np.testing.assert_array_equal(other.rows[0], memory.rows[0])

@@ -205,14 +205,22 @@ print("kept", len(outcome.seeds), flush=True)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("moment", "least"), [("workers started", 0), ("saved 2", 2)])
-def test_ctrl_c_in_a_terminal_keeps_the_finished_seeds(moment, least, tmp_path):
+@pytest.mark.parametrize(
+    ("moment", "least", "send"),
+    [
+        ("workers started", 0, lambda pid: os.killpg(pid, signal.SIGINT)),  # as a terminal does: to all processes
+        ("saved 2", 2, lambda pid: os.killpg(pid, signal.SIGINT)),
+        ("saved 2", 2, lambda pid: os.kill(pid, signal.SIGTERM)),
+    ],
+    ids=["Ctrl-C at the start", "Ctrl-C", "SIGTERM"],
+)
+def test_ctrl_c_or_sigterm_keeps_the_finished_seeds(moment, least, send, tmp_path):
     file = tmp_path / "study.npz"
     command = [sys.executable, "-W", "ignore", "-c", STUDY, file]
     child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
     with killed_after(600, child):
         assert any(line.startswith(moment) for line in child.stdout)
-        os.killpg(child.pid, signal.SIGINT)  # as a terminal does: to all of its processes
+        send(child.pid)
         out, err = child.communicate()
     assert child.returncode == 0, err
     assert "Traceback" not in err

@@ -67,7 +67,8 @@ class CheckedEnv:
                 raise self._error("the observation must be an array of numbers", observation)
         state = np.array(numbers, None if self._is_uint8 else np.float32)
         if state.shape != self.spaces.state_shape:
-            raise self._error(f"the observation must have shape {self.spaces.state_shape}", observation)
+            wanted = f"the observation must have shape {self.spaces.state_shape}, not {state.shape}"
+            raise self._error(wanted, observation)
         if self._is_uint8:
             if state.dtype != np.uint8:
                 raise self._error("the observation must be of dtype uint8, as its space says", state.dtype)
@@ -135,14 +136,11 @@ def some_states(space: Any, dtype: np.dtype, num_states: int = 8) -> np.ndarray:
 
 def spaces_of(env: gym.Env | FuncEnv) -> Spaces:
     """Returns the sizes of an environment's spaces; raises ValueError if they are missing or not supported."""
-    name = env_name(env)
-    try:
-        observations, actions = env.observation_space, env.action_space
-    except AttributeError as error:
-        raise ValueError(
-            f"env {name} must have an observation_space and an action_space, got none ({error})"
-        ) from error
-    return check_spaces(name, observations, actions)
+    observations, actions = getattr(env, "observation_space", None), getattr(env, "action_space", None)
+    if not (isinstance(observations, gym.Space) and isinstance(actions, gym.Space)):
+        got = f"{shown(observations)} and {shown(actions)}"
+        raise ValueError(f"env {env_name(env)} must have an observation_space and an action_space, got {got}")
+    return check_spaces(env_name(env), observations, actions)
 
 
 def check_spaces(name: str, observations: gym.Space, actions: gym.Space) -> Spaces:

@@ -13,6 +13,11 @@ OTHER_NAMES = {
     "learning_rate": ("learning rate", "alpha"),
     "lr": ("learning rate", "alpha"),
     "discount": ("discount factor", "gamma"),
+    "discount_factor": ("discount factor", "gamma"),
+    "target_update": ("share of Q in each update of Q-hat", "tau"),
+    "epsilon_start": ("first value of epsilon", "epsilon"),
+    "epsilon_max": ("first value of epsilon", "epsilon"),
+    "epsilon_end": ("lowest value of epsilon", "epsilon_min"),
     "buffer_size": ("size of the replay memory", "memory_size"),
     "memory": ("size of the replay memory", "memory_size"),
     "episodes": ("number of episodes", "num_episodes"),
@@ -30,7 +35,7 @@ def hints_at_fields(cls: type[T]) -> type[T]:
 
     def hint(name: str) -> str:
         what, meant = OTHER_NAMES.get(name, ("", ""))
-        close = difflib.get_close_matches(name, names, n=1)
+        close = difflib.get_close_matches(name, names, n=1, cutoff=0.75)
         end = f"; the {what} is {meant}" if what else f"; did you mean {close[0]}?" if close else ""
         return f"{cls.__name__} has no field {name}{end}"
 
@@ -42,6 +47,9 @@ def hints_at_fields(cls: type[T]) -> type[T]:
         init(self, *values, **fields)
 
     def __setattr__(self: T, name: str, value: Any) -> None:  # noqa: N807
+        if name not in names and type(self) is not cls:  # a subclass may have attributes of its own
+            object.__setattr__(self, name, value)
+            return
         if name not in names:
             raise dataclasses.FrozenInstanceError(hint(name))
         raise dataclasses.FrozenInstanceError(

@@ -35,6 +35,8 @@ def as_float(value: Any) -> float | None:
         return float(value)
     except OverflowError:  # a whole number too large for a float
         return np.inf
+    except ValueError:  # for example, a signaling NaN of decimal
+        return np.nan
 
 
 _NUMBERS = frozenset({float, int, bool, np.float64, np.float32, np.int64, np.int32})

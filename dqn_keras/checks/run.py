@@ -14,7 +14,7 @@ from gymnasium.experimental.functional import FuncEnv
 from dqn_keras._engine.private import arguments_of_compile
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import owners_optimizer
-from dqn_keras.checks.environments import no_env
+from dqn_keras.checks.environments import no_env, spaces_of
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.checks.networks import check_optimizer, warn_of_inference_mode
 from dqn_keras.checks.numbers import check_count, check_flag, check_instance, check_path, check_sequence, shown
@@ -25,6 +25,7 @@ def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> Non
     """Raises TypeError or ValueError that names the wrong argument, if there is one."""
     if not isinstance(env, gym.Env | FuncEnv):
         raise TypeError(f"env must be a gymnasium.Env or a FuncEnv, got {no_env(env)}")
+    spaces_of(env)
     check_instance("config", config, Config, "a Config")
     if not isinstance(verbose, Integral | np.bool_) or verbose not in (0, 1, 2):
         raise ValueError(f"verbose must be 0, 1 or 2, got {shown(verbose)}")

@@ -16,7 +16,7 @@ def check_transition(experience: Any, state_shape: tuple[int, ...], dtype: np.dt
     return (
         _check_state("state", state, state_shape, dtype),
         check_count("action", unwrapped(action), at_least=0),
-        check_number("reward", unwrapped(reward), at_least=-_LARGEST, at_most=_LARGEST),
+        _check_reward(unwrapped(reward)),
         _check_state("next_state", next_state, state_shape, dtype),
         _check_terminal_state(unwrapped(terminal_state)),
     )
@@ -35,6 +35,13 @@ def _check_state(name: str, value: Any, shape: tuple[int, ...], dtype: np.dtype)
         wanted = "whole numbers from 0 to 255" if dtype == np.uint8 else "finite in float32"
         raise ValueError(f"{name} must be {wanted}, got {shown(value)}")
     return state
+
+
+def _check_reward(value: Any) -> float:
+    reward = check_number("reward", value)
+    if abs(reward) > _LARGEST:
+        raise ValueError(f"reward must be finite in float32, got {shown(value)}")
+    return reward
 
 
 def _check_terminal_state(value: Any) -> Any:

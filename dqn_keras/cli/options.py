@@ -6,6 +6,7 @@ TensorFlow and Gymnasium are imported only when a command runs, so that `--help`
 import dataclasses
 import difflib
 import importlib
+import itertools
 import os
 import re
 import shlex
@@ -161,18 +162,21 @@ def parse(arguments: Sequence[str]) -> Any:
 def _hint(arguments: Sequence[str]) -> str | None:
     """Returns what to write instead of a common slip in arguments that cannot be read."""
     names = [command.__name__.lower() for command in (Train, Resume, Watch, Evaluate, Study, Plot)]
-    if arguments and arguments[0] not in names:
+    if not arguments:
+        return None
+    if arguments[0] not in names:
         close = difflib.get_close_matches(arguments[0], names, n=1)
         return f"did you mean `dqn-keras {close[0]}`?" if close else None
     are_floats = {field.name for field in dataclasses.fields(Config) if field.type is float}
-    for option, value in zip(arguments, [*arguments[1:], ""], strict=True):
+    words = [part for word in arguments for part in (word.split("=", 1) if word.startswith("--") else [word])]
+    for option, value in itertools.pairwise([*words, ""]):
         name = option.removeprefix("--").replace("-", "_")
         if name == option:
             continue
         if name in OTHER_NAMES:
             what, name_here = OTHER_NAMES[name]
             return f"the {what} is --{name_here.replace('_', '-')}"
-        if re.fullmatch(r"\(?\d+(,\d+)+\)?", value):
+        if name == "hidden_units" and re.fullmatch(r"[\[(]?\d+(,\d+)*[\])]?", value) and not value.isdigit():
             return f"spaces separate the numbers: {option} {' '.join(re.findall(r'[0-9]+', value))}"
         if name not in are_floats and re.fullmatch(r"\d+(\.0*)?(e\+?\d+)?", value) and not value.isdigit():
             return f"whole numbers have only digits: {option} {float(value):.0f}"

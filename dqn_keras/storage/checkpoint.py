@@ -32,7 +32,7 @@ class Checkpoints:
         identity: Identity,
         every: int = 100,
     ) -> None:
-        self.folder = Path(folder)
+        self.folder = Path(folder).absolute()  # a callback may change the current folder
         self._every, self._saved_at, self._is_failing = every, 0, False
         self._identity, self._other_variables = identity
         self._kept: list[Path] = []  # files of this run, newest first; the first is whole

@@ -86,18 +86,21 @@ def replacing(path: Path) -> Iterator[Path]:
 def locked(path: Path, what: str) -> Iterator[None]:
     """Makes a lock file, and its folder, and holds it while the block runs.
 
-    The system releases the lock of a process that dies. Where no file can be made, there is no lock, and nothing to
-    protect.
+    The system releases the lock of a process that dies. In a folder that cannot be written, there is no lock, and
+    nothing to protect.
 
     Raises:
         ValueError: somebody else holds the lock; the message begins with `what`.
+        OSError: the folder can be written, but not the lock file: it may belong to another user.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock: contextlib.AbstractContextManager = filelock.FileLock(path, timeout=0).acquire()
     except filelock.Timeout:
         raise ValueError(f"{what} is in use: another process or thread writes there") from None
-    except OSError:
+    except OSError as error:
+        if path.parent.is_dir() and os.access(path.parent, os.W_OK):
+            raise OSError(f"{what} cannot be locked: {error}") from error
         lock = contextlib.nullcontext()
     with lock:
         yield
