@@ -355,7 +355,7 @@ def test_rows_hold_images_exactly(dtype, rng):
 
 
 def test_bad_memories_are_refused():
-    with pytest.raises(ValueError, match=r"^dtype must be float32 or uint8"):
+    with pytest.raises(ValueError, match=r"^dtype must be np.float32 or np.uint8"):
         ReplayMemory(5, (2,), np.int64)
     with pytest.raises(TypeError, match=r"^state_shape must be a list or tuple"):
         ReplayMemory(5, 2)
