@@ -15,9 +15,9 @@ endef
 notebook: .venv/installed
 	$(BIN)/python notebooks/render.py
 
-# Each file has its own process, two at a time, since what XLA has compiled stays in the memory of a process.
+# Each file has its own process, two at a time, the largest first, since what XLA has compiled stays in a process's memory.
 test: lint
-	printf '%s\n' notebooks tests/test_*.py | xargs -n 1 -P 2 $(BIN)/python -m pytest --quiet
+	(echo notebooks; ls -S tests/test_*.py) | xargs -n 1 -P 2 $(BIN)/python -m pytest --quiet
 
 lint: .venv/installed
 	$(BIN)/ruff check .

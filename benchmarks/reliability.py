@@ -8,6 +8,7 @@ The faults are in tests/helpers/faults.py and bad_configs.py; `make test` does t
 import argparse
 import collections
 import platform
+import signal
 import tempfile
 import time
 from collections.abc import Callable
@@ -134,6 +135,7 @@ def cost_of_compiled_checks(rounds: int = 30) -> dict[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=120, help="SIGKILLs, a quarter of them inside a save (120)")
+    parser.add_argument("--only", default="", metavar="TEXT", help="only the rows whose name has this text")
     parser.add_argument("--own-kills", type=int, default=60, help="SIGKILLs of runs with own parts (60)")
     parser.add_argument("--races", type=int, default=12, help="pairs of processes in one folder (12)")
     parser.add_argument("--cases", type=int, default=2_500, help="calls of public functions (2,500)")
@@ -141,6 +143,8 @@ def main() -> None:
     parser.add_argument("--corruptions", type=int, default=5_000, help="corrupted checkpoints (5,000)")
     parser.add_argument("--configs", type=int, default=2_000, help="bad Configs (2,000)")
     arguments = parser.parse_args()
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a background job; runs here are interrupted
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     versions = f"tensorflow {tf.__version__}, keras {keras.__version__}, gymnasium {gym.__version__}"
     print("# Nothing lost, nothing silent\n")
     print(f"`python -m benchmarks.reliability --kills {arguments.kills} --signals {arguments.signals}`")
@@ -178,6 +182,8 @@ def main() -> None:
         "cost, Gymnasium loop on CartPole-v1": cost_of_checks,
         "cost, compiled episodes": cost_of_compiled_checks,
     }.items():
+        if arguments.only not in what:
+            continue
         start = time.perf_counter()
         figures = campaign()
         bad = ("differing runs", "not noticed", "silent", "not refused by name", "not one warning", "litter", "foreign")
