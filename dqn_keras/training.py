@@ -33,7 +33,11 @@ from dqn_keras.storage.networks import save_q_network
 
 @dataclasses.dataclass(repr=False)
 class Run:
-    """The result of `train`."""
+    """The result of `train`.
+
+    It can be pickled, to bring it from another process, but then Keras drops the optimizer's state. To continue a run,
+    use `checkpoint`.
+    """
 
     config: Config
     agent: Agent
@@ -128,8 +132,8 @@ def train(
         loss: any loss that Keras takes in `compile`: a name, a `keras.losses.Loss`, or a function of (y, q), both [B].
             The function returns a scalar, or [B], which is averaged. The default is the loss that you compiled
             `q_network` with, or else "mse".
-        callbacks: Keras callbacks, called as by `fit`. An episode is an epoch of one batch, with the logs that
-            `run.history` holds.
+        callbacks: Keras callbacks, called as by `fit`; None for none. An episode is an epoch of one batch, with the
+            logs that `run.history` holds.
             Callbacks see the network after each episode, may change it, and may set `model.stop_training`. Therefore
             compiled episodes are played one at a time, unless all callbacks are plain keras.callbacks.CSVLogger.
         checkpoint: a folder for the checkpoints of this run, each with its whole state; None saves none. If one cannot
