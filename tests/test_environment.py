@@ -17,7 +17,7 @@ MISBEHAVING = {
     "a word as reward": (Corridor(reward=lambda t: "one"), r"the reward must be a number, got 'one'"),
     "another shape, late": (
         Corridor(length=9, observe=lambda position, t: np.zeros(3 if t == 2 else 2)),
-        r"the observation must have shape \(2,\), got array.* in episode 0, step 1",
+        r"the observation must have shape \(2,\), not \(3,\), got array.* in episode 0, step 1",
     ),
     "no observation": (Corridor(observe=lambda position, t: {"a": 1}), r"the observation must be an array of numbers"),
 }
