@@ -16,10 +16,10 @@ class Listeners:
     """The callbacks of a run. As in `fit`, nothing more is called after an exception."""
 
     def __init__(self, run: "Run", callbacks: Sequence[keras.callbacks.Callback]) -> None:
-        self._run, self._network, self._num_episodes = run, run.q_network, run.config.num_episodes
+        self._run, self._network = run, run.q_network
         self.callbacks = list(callbacks)
         self._list = keras.callbacks.CallbackList(
-            self.callbacks, model=self._network, epochs=self._num_episodes, steps=1, verbose=0
+            self.callbacks, model=self._network, epochs=run.config.num_episodes, steps=1, verbose=0
         )
         self._log = Log(run.config)
         self._last_logs: dict[str, float] | None = None
@@ -43,7 +43,8 @@ class Listeners:
 
         If learning diverges, TerminateOnNaN asks to stop, and then there is no error.
         """
-        for number in range(len(self._run.episodes), self._num_episodes):
+        agent, number = self._run.agent, len(self._run.episodes)
+        while number < len(agent.episodes) or not agent.is_done(self._run.config):
             self._tell("on_epoch_begin", number, {})
             self._tell("on_train_batch_begin", 0, {})
             try:
@@ -61,6 +62,7 @@ class Listeners:
             yield episode
             if self._network.stop_training:
                 return
+            number += 1
 
     def _tell(self, event: str, number: int, logs: dict[str, float]) -> None:
         for callback in self.callbacks:  # a CallbackList's own methods take 50 us: they look for tensors

@@ -61,7 +61,7 @@ class Run:
 
     @property
     def rewards(self) -> np.ndarray:
-        """Each episode's undiscounted sum of rewards, [num_episodes] float64."""
+        """Each episode's undiscounted sum of rewards, [num_episodes] float64; NaN if `num_steps` cut it short."""
         return np.array([episode.reward for episode in self.episodes], np.float64)
 
     @property
@@ -108,7 +108,7 @@ def train(
     resume: bool = False,
     verbose: int = 1,
 ) -> Run:
-    """Trains a Deep Q-Network until it solves `env` or has played `config.num_episodes` episodes.
+    """Trains a Deep Q-Network until it solves `env` or has played all the episodes or steps that `config` allows.
 
     `train` uses your network, optimizer, targets, loss and environment themselves, not copies of them. It compiles them
     again at each call, so that it sees your changes.
@@ -187,13 +187,26 @@ def train(
     progress.show_end()
     if is_asked_to_stop():
         raise TrainingInterrupted(run, checkpoints.folder if checkpoints else None)
+    _warn_of_an_early_end(run)
+    return run
+
+
+def _warn_of_an_early_end(run: Run) -> None:
+    """Warns if a limit ended the run before it could do what its other numbers ask for."""
+    agent, config = run.agent, run.config
+    num_steps = agent.memory.num_appended
     if not (agent.num_updates or run.diverged):
         warnings.warn(
             f"train ended without an update: the memory holds {len(agent.memory)} transitions, "
-            f"batch_size is {config.batch_size}",
-            stacklevel=2,
+            f"batch_size is {config.batch_size}, learning_starts is {config.learning_starts}",
+            stacklevel=3,
         )
-    return run
+    if len(run.episodes) == config.num_episodes and run.solved_at is None and num_steps < (config.num_steps or 0):
+        warnings.warn(
+            f"train ended after num_episodes={config.num_episodes} episodes and {num_steps} of "
+            f"num_steps={config.num_steps} environment steps",
+            stacklevel=3,
+        )
 
 
 def _episodes(
@@ -208,12 +221,12 @@ def _episodes(
     """Returns the episodes of the loop that can play `env`."""
     if not isinstance(env, FuncEnv):
         played = gymnasium.episodes(CheckedEnv(env, watch), run.agent, run.config, formulas)
-        return watch.over(played, run.agent, run.config.num_episodes)
+        return watch.over(played, run.agent, run.config)
     # Other callbacks may read and change the agent after each episode.
     only_logs = all(type(callback) is keras.callbacks.CSVLogger for callback in callbacks)
     at_once = episodes_per_call if only_logs else 1
     played = compiled.episodes(env, spaces, run.agent, run.config, at_once, formulas)
-    return watch.over(played, run.agent, run.config.num_episodes)
+    return watch.over(played, run.agent, run.config)
 
 
 def _play_until_over(
@@ -236,7 +249,7 @@ def _play_until_over(
             if run.solved_at is not None:
                 return
             if is_asked_to_stop():
-                run.interrupted = len(run.episodes) < run.config.num_episodes
+                run.interrupted = not run.agent.is_done(run.config)
                 return
 
 
@@ -279,5 +292,7 @@ def _is_solved(episodes: Sequence[Episode], config: Config) -> bool:
     Compiled episodes stop early where it may hold (`_Loop.play`), so that a change of the rule belongs there, too.
     The original also takes the mean of fewer episodes than the window, so that one lucky first episode could stop it.
     """
+    if config.solved_reward is None:
+        return False
     last = [episode.reward for episode in episodes[-config.solved_window :]]
     return len(last) == config.solved_window and float(np.mean(last)) > config.solved_reward

@@ -8,6 +8,7 @@ from typing import Any, SupportsFloat
 import numpy as np
 
 from dqn_keras.agent import Agent, DivergedError
+from dqn_keras.config import Config
 from dqn_keras.metrics import Episode
 
 
@@ -73,13 +74,12 @@ class Watch:
         self._num_to_see -= 1
         return self._num_to_see > 0
 
-    def over(self, episodes: Iterator[Episode], agent: Agent, num_episodes: int) -> Generator[Episode, None, None]:
+    def over(self, episodes: Iterator[Episode], agent: Agent, config: Config) -> Generator[Episode, None, None]:
         """Yields the same episodes, and looks at the agent's memory once: after 1,000 states, or else at the end."""
         before, is_done = agent.memory.num_appended, False
         try:
             for episode in episodes:
-                is_over = agent.memory.num_appended - before >= _NUM_STATES or episode.number + 1 == num_episodes
-                if is_over and not is_done:
+                if not is_done and (agent.memory.num_appended - before >= _NUM_STATES or agent.is_done(config)):
                     is_done = True
                     self._look(agent)
                 yield episode
