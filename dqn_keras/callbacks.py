@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from dqn_keras.training import Run
 
 
+_NAMES = sorted(LOGGED)
+
+
 class Listeners:
     """The callbacks of a run. As in `fit`, nothing more is called after an exception."""
 
@@ -73,12 +76,12 @@ class Listeners:
         for callback in self.callbacks:
             if isinstance(callback, keras.callbacks.CSVLogger) and not callback.writer:
                 callback.keys = sorted(logs)  # or it adds an empty column val_NAME for each, at the same cost
-            if type(callback) is keras.callbacks.CSVLogger and callback.writer and callback.keys == sorted(LOGGED):
+            if type(callback) is keras.callbacks.CSVLogger and callback.writer and callback.keys == _NAMES:
                 # The same row as its on_epoch_end writes, without a search for arrays in the logs.
                 callback.writer.writer.writerow([number, *map(logs.get, callback.keys)])
                 callback.csv_file.flush()
             else:
                 callback.on_epoch_end(number, logs)
-        for name in logs.keys() - LOGGED.keys():
+        for name in logs.keys() - LOGGED.keys():  # as Keras' History has them
             values = self._run.added_logs.setdefault(name, [])
             values += [math.nan] * (number - len(values)) + [logs[name]]

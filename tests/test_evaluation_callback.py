@@ -54,6 +54,7 @@ def test_training_is_the_same_to_the_bit(env, tmp_path):
     assert run.agent.rng.bit_generator.state == other.agent.rng.bit_generator.state
 
 
+@pytest.mark.slow
 def test_a_network_with_random_state_of_its_own_is_trained_the_same():
     @keras.saving.register_keras_serializable("test_evaluation_callback")
     class Noise(keras.layers.Layer):
@@ -118,6 +119,7 @@ def test_every_log_holds_the_latest_mean_return_wherever_the_callback_stands(env
     np.testing.assert_array_equal([float(row["greedy_return"]) for row in rows], expected)
 
 
+@pytest.mark.slow
 def test_early_stopping_and_model_checkpoint_can_monitor_it(env, tmp_path):
     returns = play(env, evaluation()).history["greedy_return"]
     stop = next(i for i in range(8, 40) if max(returns[: i + 1]) == max(returns[: i - 7]))  # 8 without a better one
@@ -133,6 +135,7 @@ def test_early_stopping_and_model_checkpoint_can_monitor_it(env, tmp_path):
     assert theirs == max(run.history["greedy_return"])
 
 
+@pytest.mark.slow
 def test_what_any_callback_adds_to_the_logs_is_in_the_history(cartpole, tmp_path):
     config = Config(num_episodes=4, batch_size=16)
     callbacks = keras.callbacks.LearningRateScheduler(lambda epoch, rate: 0.5 / (epoch + 1)), evaluation()
@@ -200,21 +203,26 @@ def test_a_resumed_run_refuses_a_file_that_holds_no_network_of_it(tmp_path):
     assert best.exists()
 
 
+@pytest.mark.slow
 def test_the_averaged_weights_of_the_end_are_evaluated(cartpole):
-    greedy = evaluation()
-    optimizer = keras.optimizers.Adam(use_ema=True, ema_momentum=0.9)
-    run = play(cartpole, greedy, optimizer=optimizer)
-    assert greedy.returns[-1] == evaluate(gym.make("CartPole-v1"), run.q_network, 3, seed=0).mean()
+    greedy = evaluation(every_steps=1)
+    run = play(cartpole, greedy, optimizer=keras.optimizers.Adam(use_ema=True, ema_momentum=0.9))
+    assert greedy.steps[-2:] == [sum(run.history["steps"])] * 2  # the network of the last step, and the average
+    assert greedy.returns[-1] == evaluate(cartpole, run.q_network, 3, seed=0).mean()
 
 
-def test_a_diverged_network_is_not_evaluated(env):
-    greedy, heard = evaluation(every_steps=1), keras.callbacks.History()
+@pytest.mark.slow
+@pytest.mark.parametrize(("every_steps", "num_evaluations"), [(1, 13), (10_000, 1)])
+def test_a_diverged_network_is_not_evaluated(env, every_steps, num_evaluations):
+    greedy, heard = evaluation(every_steps=every_steps), keras.callbacks.History()
     run = play(env, greedy, heard, SpoiledVelocity(), keras.callbacks.TerminateOnNaN())
     assert run.diverged
-    assert len(run.history["greedy_return"]) == len(run.rewards) == len(greedy.steps) - 1 == 12
+    assert len(greedy.steps) == num_evaluations
+    assert len(run.history["greedy_return"]) == len(run.rewards) == 12
     assert math.isnan(heard.history["greedy_return"][12])
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_a_warning_and_the_next_better_network_is_kept(env, tmp_path, monkeypatch):
     def fail(self, *_, **__):
         raise OSError("no space left")
@@ -256,6 +264,11 @@ def test_an_environment_that_does_not_fit_is_told_before_any_work_starts(cartpol
             r"actions, got with float32 states of shape \(2,\) and 2 actions",
         ):
             play(env, Evaluation(Corridor(), 100))
+
+
+def test_two_evaluations_in_a_run_are_refused(env):
+    with pytest.raises(ValueError, match=r"^callbacks must hold one Evaluation, .* got 2$"):
+        play(env, evaluation(), evaluation())
 
 
 def test_bad_arguments_are_named(cartpole):

@@ -41,15 +41,18 @@ def check_callbacks(
 
     Raises:
         TypeError: one is not a Keras callback.
-        ValueError: an Evaluation does not fit the environment `env` of the run.
+        ValueError: there are two Evaluations, or one that does not fit the environment `env` of the run.
     """
     if callbacks is None or isinstance(callbacks, keras.callbacks.Callback):
         callbacks = [] if callbacks is None else [callbacks]
     check_instance("callbacks", callbacks, list | tuple, "a Keras callback or a list of them")
     for callback in callbacks:
         check_instance("callbacks", callback, keras.callbacks.Callback, "Keras callbacks")
-        if isinstance(callback, Evaluation):
-            _check_evaluation(callback, env)
+    evaluations = [callback for callback in callbacks if isinstance(callback, Evaluation)]
+    if len(evaluations) > 1:
+        raise ValueError(f"callbacks must hold one Evaluation, as there is one greedy_return, got {len(evaluations)}")
+    for evaluation in evaluations:
+        _check_evaluation(evaluation, env)
     return list(callbacks)
 
 
