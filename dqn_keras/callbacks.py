@@ -6,10 +6,14 @@ from typing import TYPE_CHECKING
 
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import DivergedError
+from dqn_keras.evaluation import Evaluation
 from dqn_keras.metrics import LOGGED, Episode, Log
 
 if TYPE_CHECKING:
     from dqn_keras.training import Run
+
+
+_NAMES = sorted(LOGGED)
 
 
 class Listeners:
@@ -17,7 +21,8 @@ class Listeners:
 
     def __init__(self, run: "Run", callbacks: Sequence[keras.callbacks.Callback]) -> None:
         self._run, self._network = run, run.q_network
-        self.callbacks = list(callbacks)
+        # Evaluations come first, so that all others find their mean return in the logs.
+        self.callbacks = sorted(callbacks, key=lambda callback: not isinstance(callback, Evaluation))
         self._list = keras.callbacks.CallbackList(
             self.callbacks, model=self._network, epochs=run.config.num_episodes, steps=1, verbose=0
         )
@@ -25,14 +30,14 @@ class Listeners:
         self._last_logs: dict[str, float] | None = None
         for episode, speed in zip(run.episodes, run.steps_per_second, strict=True):
             self._log.add(episode, speed)
+        for callback in self.callbacks:
+            if isinstance(callback, Evaluation):
+                callback.num_steps = sum(episode.steps for episode in run.episodes)
 
     def begin(self) -> None:
         """Calls `on_train_begin`."""
         self._network.stop_training = False
         self._list.on_train_begin()
-        for callback in self.callbacks:
-            if isinstance(callback, keras.callbacks.CSVLogger):
-                callback.keys = sorted(LOGGED)  # or it adds an empty column val_NAME for each, at the same cost
 
     def end(self) -> None:
         """Calls `on_train_end`."""
@@ -71,9 +76,14 @@ class Listeners:
     def _end_epoch(self, number: int, logs: dict[str, float]) -> None:
         self._last_logs = logs
         for callback in self.callbacks:
-            if type(callback) is keras.callbacks.CSVLogger and callback.writer:
+            if isinstance(callback, keras.callbacks.CSVLogger) and not callback.writer:
+                callback.keys = sorted(logs)  # or it adds an empty column val_NAME for each, at the same cost
+            if type(callback) is keras.callbacks.CSVLogger and callback.writer and callback.keys == _NAMES:
                 # The same row as its on_epoch_end writes, without a search for arrays in the logs.
                 callback.writer.writer.writerow([number, *map(logs.get, callback.keys)])
                 callback.csv_file.flush()
             else:
                 callback.on_epoch_end(number, logs)
+        for name in logs.keys() - LOGGED.keys():  # as Keras' History has them
+            values = self._run.added_logs.setdefault(name, [])
+            values += [math.nan] * (number - len(values)) + [logs[name]]

@@ -11,13 +11,15 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 import gymnasium as gym
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
+from numpy.typing import ArrayLike
 
+from dqn_keras._engine.numpy_acting import q_values_now
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import Agent, keeps_averages, make_agent, optimizer_shown, owners_optimizer
 from dqn_keras.callbacks import Listeners
 from dqn_keras.checks.environments import CheckedEnv, Spaces, check_environment, env_name, some_states
 from dqn_keras.checks.formulas import Formulas
-from dqn_keras.checks.observations import Watch
+from dqn_keras.checks.observations import Watch, check_state
 from dqn_keras.checks.run import check_arguments, check_callbacks, check_checkpoint, check_own_parts
 from dqn_keras.config import Config
 from dqn_keras.interruption import TrainingInterrupted, stop_requests
@@ -48,6 +50,10 @@ class Run:
     """Whether learning diverged, and a callback (keras.callbacks.TerminateOnNaN) ended the run without an error."""
     steps_per_second: list[float] = dataclasses.field(default_factory=list)
     """Environment steps per second of each episode, learning included; NaN for episodes from before a resume."""
+    first_action: int = 0
+    """The environment's number for the action of index 0."""
+    added_logs: dict[str, list] = dataclasses.field(default_factory=dict)
+    """What callbacks added to the logs, such as `greedy_return`."""
 
     @property
     def solved_at(self) -> int | None:
@@ -66,8 +72,13 @@ class Run:
 
     @property
     def history(self) -> dict[str, list[float]]:
-        """The logs that callbacks get, one list for each name, like `history` in the result of Keras' `model.fit`."""
-        return history(self.episodes, self.config, self.steps_per_second)
+        """The logs of callbacks, one list for each name, like `history` in the result of Keras' `model.fit`.
+
+        What a callback adds to the logs is there, too, with NaN for episodes in which it added nothing.
+        """
+        num_episodes = len(self.episodes)
+        added = {name: [*values, *[math.nan] * num_episodes][:num_episodes] for name, values in self.added_logs.items()}
+        return history(self.episodes, self.config, self.steps_per_second) | added
 
     @property
     def seed(self) -> int:
@@ -83,6 +94,19 @@ class Run:
     def q_hat_network(self) -> keras.Sequential:
         """The slow copy, which gave the targets."""
         return self.agent.q_hat_network
+
+    def act(self, state: ArrayLike) -> int:
+        """Returns the greedy action in one state, as the environment numbers its actions: `env.step(run.act(state))`.
+
+        Args:
+            state: an observation of the environment, [*S].
+
+        Raises:
+            TypeError, ValueError: `state` is not an array of finite numbers of shape [*S].
+        """
+        memory = self.agent.memory
+        checked = check_state("state", state, memory.state_shape, memory.rows.dtype)
+        return self.first_action + int(q_values_now(self.q_network, checked).argmax())
 
     def save(self, path: str | os.PathLike) -> None:
         """Saves only the network that acts, as a .keras file; `load_q_network`, or Keras anywhere, loads it."""
@@ -157,7 +181,7 @@ def train(
             diverged.
     """
     check_arguments(env, config, verbose)
-    callbacks = check_callbacks(callbacks)
+    callbacks = check_callbacks(callbacks, env)
     checkpoint_every = check_checkpoint(checkpoint, checkpoint_every, resume)
     spaces = check_environment(env, q_network)
     formulas = check_own_parts(config, q_network, optimizer, targets, loss)
@@ -174,7 +198,7 @@ def train(
             resumed_from = checkpoints.begin(agent, seed, resume)
             if verbose and resume:
                 print(f"Resumed at episode {len(agent.episodes)} from {resumed_from}" if resumed_from else "A new run")
-        run = Run(config, agent, steps_per_second=[math.nan] * len(agent.episodes))
+        run = Run(config, agent, steps_per_second=[math.nan] * len(agent.episodes), first_action=spaces.first_action)
         episodes_per_call = min(100, checkpoint_every) if checkpoints else 100
         watch = Watch(env_name(env), env.observation_space, is_default_network=q_network is None)
         played = _timed(_episodes(env, spaces, run, formulas, callbacks, episodes_per_call, watch), run)

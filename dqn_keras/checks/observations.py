@@ -8,6 +8,7 @@ from typing import Any, SupportsFloat
 import numpy as np
 
 from dqn_keras.agent import Agent, DivergedError
+from dqn_keras.checks.numbers import shown
 from dqn_keras.config import Config
 from dqn_keras.metrics import Episode
 
@@ -21,6 +22,28 @@ def as_numbers(value: Any) -> np.ndarray | None:
     except Exception:  # whatever the array's own library raises
         return None
     return array if np.can_cast(array.dtype, np.float32, "same_kind") else None
+
+
+def check_state(name: str, value: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """Returns one state as an array of `shape` and `dtype`, float32 or uint8; otherwise raises an error that names it.
+
+    Raises:
+        TypeError: `value` is not an array of numbers.
+        ValueError: it has another shape, a value that is not finite in float32, or a dtype other than uint8 if the
+            states are uint8.
+    """
+    numbers = as_numbers(value)
+    if numbers is None:
+        raise TypeError(f"{name} must be an array of numbers, got {shown(value)}")
+    if numbers.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {numbers.shape}")
+    if dtype == np.uint8 != numbers.dtype:
+        raise ValueError(f"{name} must be of dtype uint8, as the observations of env, got {numbers.dtype}")
+    with np.errstate(over="ignore"):
+        state = numbers.astype(dtype)
+    if not np.isfinite(state).all():
+        raise ValueError(f"{name} must be finite in float32, got {shown(value)}")
+    return state
 
 
 def as_float(value: Any) -> float | None:
