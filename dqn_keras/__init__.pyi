@@ -15,6 +15,7 @@ from .networks import make_q_network as make_q_network
 from .plotting import plot_rewards as plot_rewards
 from .plotting import plot_run as plot_run
 from .plotting import plot_study as plot_study
+from .plotting import plot_sweep as plot_sweep
 from .policy import action as action
 from .policy import decay_epsilon as decay_epsilon
 from .rendering import animate as animate
@@ -25,10 +26,14 @@ from .replay import ReplayMemory as ReplayMemory
 from .seeding import episode_seed as episode_seed
 from .statistics import compare as compare
 from .statistics import summarize as summarize
+from .statistics import sweep_table as sweep_table
 from .storage.networks import load_q_network as load_q_network
 from .study import Study as Study
+from .study import Sweep as Sweep
 from .study import load_study as load_study
+from .study import load_sweep as load_sweep
 from .study import study as study
+from .study import sweep as sweep
 from .training import Run as Run
 from .training import train as train
 from .version import __version__ as __version__

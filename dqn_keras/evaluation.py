@@ -6,24 +6,30 @@ import warnings
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras._engine.numpy_acting import q_function
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import keeps_averages
-from dqn_keras.checks.environments import CheckedEnv
+from dqn_keras.checks.environments import CheckedEnv, Spaces, check_functional
 from dqn_keras.checks.networks import check_fits
 from dqn_keras.checks.numbers import check_count, check_path, shown
+from dqn_keras.loops.greedy import greedy_returns
 from dqn_keras.seeding import checked_seed, evaluation_seed
 from dqn_keras.storage.networks import load_q_network, save_q_network
 
 
 def evaluate(
-    env: gym.Env, q_network: keras.Model, num_episodes: int = 100, seed: int | None = None, max_steps: int = 1_000
+    env: gym.Env | FuncEnv,
+    q_network: keras.Model,
+    num_episodes: int = 100,
+    seed: int | None = None,
+    max_steps: int = 1_000,
 ) -> np.ndarray:
     """Plays greedily without learning, and returns each episode's undiscounted return, [num_episodes] float64.
 
     Args:
-        env: a gymnasium.Env, as for `train`.
+        env: an environment, as for `train`. All episodes of a functional one are compiled into one call.
         q_network: a network, states [B, *S] -> Q-values [B, A].
         num_episodes: number of episodes.
         seed: a whole number; None draws one. The start of episode k depends on (seed, k) alone; `train` never uses it.
@@ -32,10 +38,13 @@ def evaluate(
     Raises:
         TypeError, ValueError: as for `train`; or the network does not fit the environment.
     """
-    checked_env = CheckedEnv(env)
-    check_fits(q_network, checked_env.spaces.state_shape, checked_env.spaces.num_actions)
+    spaces = _spaces(env)
+    check_fits(q_network, spaces.state_shape, spaces.num_actions)
     num_episodes, max_steps = check_count("num_episodes", num_episodes), check_count("max_steps", max_steps)
     seed = checked_seed(seed)
+    if isinstance(env, FuncEnv):
+        return greedy_returns(env, spaces, q_network, num_episodes, seed, max_steps)
+    checked_env = CheckedEnv(env)
     q_values = q_function(q_network)
     returns = np.zeros(num_episodes)
     for episode in range(num_episodes):
@@ -46,6 +55,10 @@ def evaluate(
             if terminated or truncated:
                 break
     return returns
+
+
+def _spaces(env: gym.Env | FuncEnv) -> Spaces:
+    return check_functional(env) if isinstance(env, FuncEnv) else CheckedEnv(env).spaces
 
 
 class Evaluation(keras.callbacks.Callback):
@@ -65,8 +78,8 @@ class Evaluation(keras.callbacks.Callback):
     A resumed run evaluates the network in `best` first, and replaces it only by a better one. A new run replaces it.
 
     Args:
-        env: a gymnasium.Env, with the states and actions of the environment that is trained in, but not that object:
-            wrappers and environments may keep something from one episode to the next.
+        env: an environment with the states and actions of the one that is trained in, but another object: wrappers and
+            environments may keep something from one episode to the next. (A functional environment may be the same.)
         every_steps: environment steps of the run from one evaluation to the next.
         num_episodes: number of episodes of an evaluation.
         best: a .keras file for the network with the highest mean return, which `load_q_network` loads; of equal ones,
@@ -87,7 +100,7 @@ class Evaluation(keras.callbacks.Callback):
 
     def __init__(
         self,
-        env: gym.Env,
+        env: gym.Env | FuncEnv,
         every_steps: int,
         num_episodes: int = 10,
         best: str | os.PathLike | None = None,
@@ -96,7 +109,7 @@ class Evaluation(keras.callbacks.Callback):
         max_steps: int = 1_000,
     ) -> None:
         super().__init__()
-        self.spaces = CheckedEnv(env).spaces
+        self.spaces = _spaces(env)
         self.env = env
         self.every_steps = check_count("every_steps", every_steps)
         self.num_episodes = check_count("num_episodes", num_episodes)

@@ -5,6 +5,8 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from dqn_keras.config import Config
 
 
@@ -30,6 +32,24 @@ class Episode(NamedTuple):
     """Highest reward of a single step."""
     terminated: bool
     """Whether the environment terminated it; False after a time limit."""
+
+
+class Outcome(NamedTuple):
+    """The result of one seed of a study."""
+
+    seed: int
+    rewards: np.ndarray
+    """Reward of each episode, [num_episodes] float64, as in `Run.rewards`."""
+    steps: np.ndarray
+    """Environment steps of each episode, [num_episodes] int64."""
+    solved_at: int | None
+    """Number of the episode after which the stop rule held, as in `Run.solved_at`; None if it never did."""
+    greedy_return: float
+    """Mean return of 100 greedy episodes after the run; NaN without `evaluate_on`."""
+    seconds: float
+    """Time that the training took, without the evaluation."""
+    digest: bytes
+    """SHA-256 of the final weights of both networks: equal if all bits are equal."""
 
 
 LOGGED = {

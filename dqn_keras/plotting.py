@@ -1,7 +1,7 @@
 """Learning curves: of one run, together with its other logged values, and of many runs."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 
 from dqn_keras.checks.numbers import (
     check_array,
+    check_choice,
     check_count,
     check_flag,
     check_instance,
@@ -17,7 +18,8 @@ from dqn_keras.checks.numbers import (
     shown,
 )
 from dqn_keras.config import Config
-from dqn_keras.study import Study
+from dqn_keras.statistics import Estimate, summarize
+from dqn_keras.study import Study, Sweep
 from dqn_keras.training import Run
 
 
@@ -95,64 +97,154 @@ def plot_history(history: Mapping[str, Sequence[float]], config: Config, speed: 
 
 
 def plot_study(
-    study: Study, axes: Sequence[Axes] | np.ndarray | None = None, published: float | None = 293
+    study: Study,
+    axes: Sequence[Axes] | np.ndarray | None = None,
+    published: float | None = 293,
+    x: Literal["episodes", "env_steps"] = "episodes",
 ) -> np.ndarray:
-    """Plots many seeds in three pictures: the learning curves, the episodes to solved, the share solved by episode.
+    """Plots many seeds in three pictures: the learning curves, when they are solved, and the share solved by then.
+
+    Without a stop rule (`solved_reward=None`), the last two show the rewards at the end of the runs instead.
 
     Args:
         study: a study with any number of seeds.
         axes: the three Axes to draw in; by default those of a new figure, 15 by 4.5 inches.
         published: an episode to mark: how many one published run needed, such as the original's 293. None marks
             nothing.
+        x: what runs are measured in: episodes, or environment steps.
     """
     check_instance("study", study, Study, "a Study")
     if published is not None:
         published = check_number("published", published, at_least=0)
-    if not study.outcomes or study.config.num_episodes < study.config.solved_window:
+    is_steps = check_choice("x", x, ("episodes", "env_steps")) == "env_steps"
+    window, config = study.config.solved_window, study.config
+    if not study.outcomes or min(np.isfinite(outcome.rewards).sum() for outcome in study.outcomes) < window:
         raise ValueError(f"study must have seeds with at least solved_window episodes each, got {study}")
     if axes is None:
         _, axes = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained")
     curves, distribution, shares = _three(axes)
-    window, config = study.config.solved_window, study.config
-    solved = np.sort(study.solved_at[np.isfinite(study.solved_at)])
-    num_seeds, num_unsolved = len(study.outcomes), len(study.outcomes) - len(solved)
-    until = int(1.5 * np.quantile(study.episodes_to_solved, 0.9)) + 1  # the slowest curves are cut off here
+    ends = study.env_steps_to_solved if is_steps else study.episodes_to_solved
+    if config.solved_reward is None:
+        ends = np.array([o.steps.sum() if is_steps else len(o.rewards) for o in study.outcomes])
+    until = int(1.5 * np.quantile(ends, 0.9)) + 1  # the slowest curves are cut off here
+    label = "Environment steps" if is_steps else "Episode"
 
-    means = np.full((num_seeds, study.rewards.shape[1]), np.nan)  # of the last `window` episodes
-    for row, outcome in zip(means, study.outcomes, strict=True):
-        mean = np.convolve(outcome.rewards, np.full(window, 1 / window), mode="valid")
-        row[window - 1 : len(outcome.rewards)] = mean
-        row[len(outcome.rewards) :] = mean[-1]  # after its end, a run keeps its last mean
-    means = means[:, :until]
-    faint = curves.plot(means.T, color="0.5", alpha=max(0.02, min(1, 10 / num_seeds)), linewidth=0.7)
+    places, means = _curves(study, until, is_steps)
+    num_seeds = len(study.outcomes)
+    faint = curves.plot(places, means.T, color="0.5", alpha=max(0.02, min(1, 10 / num_seeds)), linewidth=0.7)
     faint[0].set_label("each seed")
-    episodes = np.arange(window - 1, means.shape[1])
-    low, median, high = np.nanquantile(means[:, window - 1 :], (0.25, 0.5, 0.75), axis=0)
-    curves.fill_between(episodes, low, high, color="tab:blue", alpha=0.35, label="middle half of the seeds")
-    curves.plot(episodes, median, color="tab:blue", linewidth=2, label="median")
-    curves.axhline(config.solved_reward, color="black", linestyle=":", linewidth=1, label="solved")
-    curves.set(xlabel="Episode", ylabel=f"Mean reward of the last {window} episodes", title=f"{num_seeds} seeds")
+    low, median, high = np.nanquantile(means, (0.25, 0.5, 0.75), axis=0)
+    curves.fill_between(places, low, high, color="tab:blue", alpha=0.35, label="middle half of the seeds")
+    curves.plot(places, median, color="tab:blue", linewidth=2, label="median")
+    if config.solved_reward is not None:
+        curves.axhline(config.solved_reward, color="black", linestyle=":", linewidth=1, label="solved")
+    curves.set(xlabel=label, ylabel=f"Mean reward of the last {window} episodes", title=f"{num_seeds} seeds")
     curves.legend(loc="lower right")
 
-    distribution.hist(np.minimum(solved, until), bins=40, color="tab:blue", alpha=0.7)
-    distribution.axvline(np.median(study.episodes_to_solved), color="tab:blue", linewidth=2, label="median")
-    late = int((solved > until).sum())
-    title = f"{late} later (in the last bar), {num_unsolved} not within {config.num_episodes:,}"
-    distribution.set(xlabel="Episodes to solved", ylabel="Seeds", title=title)
+    if config.solved_reward is None:
+        _plot_ends(means[:, -1], window, distribution, shares)
+    else:
+        _plot_solved(study, ends, until, is_steps, None if is_steps else published, distribution, shares)
+    return np.asarray(axes)
 
-    ends = [*solved, config.num_episodes]
-    shares.step(ends, np.minimum(np.arange(1, len(ends) + 1), len(solved)) / num_seeds, where="post", linewidth=2)
-    shares.set(xscale="log", xlabel="Episodes", ylabel="Share of seeds solved", ylim=(0, 1.02))
-    shares.set(title=f"{len(solved) / num_seeds:.1%} solved in the end", xlim=(0.8 * ends[0], config.num_episodes))
-    ticks = [k for k in (100, 200, 300, 500, 1_000, 2_000) if k <= config.num_episodes]
-    shares.set_xticks(ticks, map(str, ticks))
-    shares.minorticks_off()
+
+def _curves(study: Study, until: int, is_steps: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Returns places on the x-axis [N], and the mean of each seed's last rewards there [S, N].
+
+    After its end, a run keeps its last mean.
+    """
+    window = study.config.solved_window
+    longest = max(len(outcome.rewards) for outcome in study.outcomes)
+    places = np.linspace(0, until, 500) if is_steps else np.arange(window - 1, min(until, longest))
+    rows = []
+    for outcome in study.outcomes:
+        rewards = outcome.rewards[np.isfinite(outcome.rewards)]  # all but an episode that is cut short
+        mean = np.convolve(rewards, np.full(window, 1 / window), mode="valid")
+        at = outcome.steps.cumsum()[window - 1 : len(rewards)] if is_steps else np.arange(window - 1, len(rewards))
+        rows.append(np.interp(places, at, mean, left=np.nan))
+    means = np.array(rows)
+    is_known = ~np.isnan(means).all(axis=0)
+    return places[is_known], means[:, is_known]
+
+
+def _plot_solved(
+    study: Study,
+    ends: np.ndarray,
+    until: int,
+    is_steps: bool,
+    published: float | None,
+    distribution: Axes,
+    shares: Axes,
+) -> None:
+    """Plots when the seeds are solved, as a histogram and as the share solved by then."""
+    config, num_seeds = study.config, len(study.outcomes)
+    solved = np.sort(ends[np.isfinite(study.solved_at)])
+    most = (config.num_steps or config.num_episodes * config.max_steps) if is_steps else config.num_episodes
+    unit = "environment steps" if is_steps else "episodes"
+    distribution.hist(np.minimum(solved, until), bins=40, color="tab:blue", alpha=0.7)
+    distribution.axvline(np.median(ends), color="tab:blue", linewidth=2, label="median")
+    late = int((solved > until).sum())
+    title = f"{late} later (in the last bar), {num_seeds - len(solved)} not within {most:,}"
+    distribution.set(xlabel=f"{unit.capitalize()} to solved", ylabel="Seeds", title=title)
+
+    steps = [*solved, most]
+    shares.step(steps, np.minimum(np.arange(1, len(steps) + 1), len(solved)) / num_seeds, where="post", linewidth=2)
+    shares.set(xscale="log", xlabel=unit.capitalize(), ylabel="Share of seeds solved", ylim=(0, 1.02))
+    shares.set(title=f"{len(solved) / num_seeds:.1%} solved in the end", xlim=(0.8 * steps[0], most))
+    if not is_steps:
+        ticks = [k for k in (100, 200, 300, 500, 1_000, 2_000) if k <= most]
+        shares.set_xticks(ticks, map(str, ticks))
+        shares.minorticks_off()
     shares.grid(alpha=0.3)
     if published is not None:
         for ax in (distribution, shares):
             ax.axvline(published, color="tab:orange", linestyle="--", label=f"the one published run ({published:g})")
     distribution.legend(loc="upper right")
-    return np.asarray(axes)
+
+
+def _plot_ends(means: np.ndarray, window: int, distribution: Axes, shares: Axes) -> None:
+    """Plots the mean rewards at the end of runs without a stop rule, as a histogram and as a distribution function."""
+    label = f"Mean reward of the last {window} episodes"
+    distribution.hist(means, bins=40, color="tab:blue", alpha=0.7)
+    distribution.axvline(np.median(means), color="tab:blue", linewidth=2, label="median")
+    distribution.set(xlabel=label, ylabel="Seeds", title="At the end of the runs")
+    distribution.legend(loc="upper left")
+    shares.ecdf(means, complementary=True, linewidth=2)
+    shares.set(xlabel=label, ylabel="Share of seeds with at least this", ylim=(0, 1.02), title="At the end of the runs")
+    shares.grid(alpha=0.3)
+
+
+def plot_sweep(sweep: Sweep, late_after: int = 500) -> np.ndarray:
+    """Plots the settings of a sweep side by side: a dot and a 95 % interval for each statistic of each setting.
+
+    The statistics are the share of seeds that are late or never solved, the median of the episodes to solved, and, with
+    `evaluate_on`, the greedy return. Returns the Axes; `plot_sweep(sweep)[0].figure` is the figure.
+
+    Args:
+        sweep: the result of `sweep`.
+        late_after: number of episodes after which a seed counts as late.
+    """
+    check_instance("sweep", sweep, Sweep, "a Sweep")
+    summaries = [summarize(study, late_after) for study in sweep.values()]
+    late = [Estimate(*(100 * x for x in summary.share_late)) for summary in summaries]
+    panels = {
+        f"Not solved by episode {late_after} (%)": late,
+        "Episodes to solved, median": [x.median for x in summaries],
+    }
+    if not all(np.isnan(x.greedy_return.value) for x in summaries):
+        panels["Greedy return, mean"] = [x.greedy_return for x in summaries]
+    size = 3.4 * len(panels) + 2, 0.32 * len(sweep) + 1.3
+    _, axes = plt.subplots(1, len(panels), figsize=size, layout="constrained", sharey=True, squeeze=False)
+    rows = np.arange(len(sweep))
+    for ax, (label, estimates) in zip(axes[0], panels.items(), strict=True):
+        value, low, high = np.array(estimates, np.float64).T
+        low, high = np.where(np.isnan(low), value, low), np.where(np.isnan(high), value, high)
+        ax.errorbar(value, rows, xerr=[value - low, high - value], fmt="o", color="tab:blue", capsize=3)
+        ax.set(xlabel=label)
+        ax.grid(alpha=0.3)
+    axes[0, 0].set_yticks(rows, list(sweep))
+    axes[0, 0].invert_yaxis()
+    return axes[0]
 
 
 def _three(axes: Any) -> Sequence[Axes]:

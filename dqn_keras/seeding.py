@@ -33,6 +33,11 @@ def evaluation_seed(seed: int, episode: int) -> int:
     return int(_derived(seed, 3, episode).generate_state(1)[0])
 
 
+def evaluation_key(seed: int) -> np.int64:
+    """Returns the number that determines the start states of compiled greedy episodes."""
+    return _derived(seed, 5).generate_state(1, np.uint64).view(np.int64)[0]
+
+
 def draws_key(seed: int) -> np.int64:
     """Returns the number that determines all random draws of a compiled run."""
     return _derived(seed, 4).generate_state(1, np.uint64).view(np.int64)[0]

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-from dqn_keras.checks.numbers import check_instance
-from dqn_keras.study import Study
+from dqn_keras.checks.numbers import check_count, check_instance
+from dqn_keras.study import Study, Sweep
 
 
 class Estimate(NamedTuple):
@@ -23,6 +23,10 @@ class Estimate(NamedTuple):
             return f"{self.value:.{digits}f}"
         return f"{self.value:.{digits}f} ({self.low:.{digits}f} to {self.high:.{digits}f})"
 
+    def as_percent(self) -> str:
+        """Returns a share in percent, with its interval."""
+        return f"{100 * self.value:.1f} % ({100 * self.low:.1f} to {100 * self.high:.1f})"
+
 
 class Summary(NamedTuple):
     """The statistics of a study. A seed that was not solved counts with `num_episodes` episodes."""
@@ -33,18 +37,52 @@ class Summary(NamedTuple):
     """Median of the episodes to solved; bootstrap interval. If most seeds are solved, the slowest do not change it."""
     interquartile_mean: Estimate
     """Mean of the middle half of the episodes to solved; bootstrap interval."""
+    share_late: Estimate
+    """Share of the seeds that need more than `late_after` episodes, or are never solved; Wilson interval."""
+    median_env_steps: Estimate
+    """Median of the environment steps to solved; bootstrap interval."""
+    greedy_return: Estimate
+    """Mean over the seeds of the greedy return after the run; bootstrap interval; NaN without `evaluate_on`."""
 
 
-def summarize(study: Study) -> Summary:
-    """Returns the share of seeds solved, and the median and interquartile mean of the episodes to solved."""
+def summarize(study: Study, late_after: int = 500) -> Summary:
+    """Returns the share of seeds solved, how long they take, and how well they play in the end.
+
+    Args:
+        study: a study with at least one seed.
+        late_after: number of episodes after which a seed counts as late.
+    """
     _check_study("study", study)
-    episodes, num_solved = study.episodes_to_solved, int(np.isfinite(study.solved_at).sum())
-    share = scipy.stats.binomtest(num_solved, len(episodes)).proportion_ci(method="wilson")
+    late_after = check_count("late_after", late_after)
+    episodes = study.episodes_to_solved
+    is_solved = np.isfinite(study.solved_at)
     return Summary(
-        Estimate(num_solved / len(episodes), float(share.low), float(share.high)),
+        _share(is_solved),
         _bootstrap(np.median, episodes),
         _bootstrap(functools.partial(scipy.stats.trim_mean, proportiontocut=0.25), episodes),
+        _share(~is_solved | (episodes > late_after)),
+        _bootstrap(np.median, study.env_steps_to_solved),
+        _bootstrap(np.mean, study.greedy_returns),
     )
+
+
+def sweep_table(sweep: Sweep, late_after: int = 500) -> str:
+    """Returns a Markdown table with a row for each setting of a sweep: the statistics of `summarize`."""
+    check_instance("sweep", sweep, Sweep, "a Sweep")
+    rows = ["| setting | seeds | solved | late or never | median episodes to solved | greedy return |"]
+    rows.append("|---|---|---|---|---|---|")
+    for name, study in sweep.items():
+        x = summarize(study, late_after)
+        shares = x.share_solved.as_percent(), x.share_late.as_percent()
+        greedy = "" if np.isnan(x.greedy_return.value) else str(x.greedy_return)
+        rows.append(f"| {name} | {len(study.outcomes)} | {shares[0]} | {shares[1]} | {x.median} | {greedy} |")
+    return "\n".join(rows)
+
+
+def _share(claims: np.ndarray) -> Estimate:
+    """Returns the share of true claims, with its Wilson interval."""
+    interval = scipy.stats.binomtest(int(claims.sum()), len(claims)).proportion_ci(method="wilson")
+    return Estimate(float(claims.mean()), float(interval.low), float(interval.high))
 
 
 class Comparison(NamedTuple):
@@ -82,7 +120,7 @@ def _probability_of_improvement(first: np.ndarray, second: np.ndarray, axis: int
 
 def _bootstrap(statistic: Any, *samples: np.ndarray) -> Estimate:
     value = float(statistic(*samples))
-    if all(len(np.unique(sample)) == 1 for sample in samples):  # for example, one seed: nothing to resample
+    if np.isnan(value) or all(len(np.unique(sample)) == 1 for sample in samples):  # for example, one seed
         return Estimate(value, np.nan, np.nan)
     interval = scipy.stats.bootstrap(
         samples, statistic, n_resamples=2_000, method="percentile", rng=np.random.default_rng(0), batch=200

@@ -183,12 +183,7 @@ def train(
     check_arguments(env, config, verbose)
     callbacks = check_callbacks(callbacks, env)
     checkpoint_every = check_checkpoint(checkpoint, checkpoint_every, resume)
-    spaces = check_environment(env, q_network)
-    formulas = check_own_parts(config, q_network, optimizer, targets, loss)
-    some = some_states(env.observation_space, spaces.state_dtype)
-    sizes = spaces.state_shape, spaces.num_actions
-    seed_in_use = checked_seed(seed)
-    agent = make_agent(*sizes, config, seed_in_use, q_network, optimizer, formulas.loss, some, spaces.state_dtype)
+    spaces, formulas, agent = prepare(env, config, checked_seed(seed), q_network, optimizer, targets, loss)
     checkpoints = None
     if checkpoint is not None:
         saved_as = identity(env, config, agent, formulas, q_network, optimizer or owners_optimizer(q_network))
@@ -231,6 +226,24 @@ def _warn_of_an_early_end(run: Run) -> None:
             f"num_steps={config.num_steps} environment steps",
             stacklevel=3,
         )
+
+
+def prepare(
+    env: gym.Env | FuncEnv,
+    config: Config,
+    seed: int,
+    q_network: keras.Model | None,
+    optimizer: keras.Optimizer | None,
+    targets: Callable,
+    loss: str | Callable | None,
+) -> tuple[Spaces, Formulas, Agent]:
+    """Checks the parts of a run, and returns the sizes of its spaces, its formulas and a new agent."""
+    spaces = check_environment(env, q_network)
+    formulas = check_own_parts(config, q_network, optimizer, targets, loss)
+    some = some_states(env.observation_space, spaces.state_dtype)
+    sizes = spaces.state_shape, spaces.num_actions
+    agent = make_agent(*sizes, config, seed, q_network, optimizer, formulas.loss, some, spaces.state_dtype)
+    return spaces, formulas, agent
 
 
 def _episodes(

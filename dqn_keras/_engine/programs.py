@@ -64,6 +64,21 @@ class Learner(NamedTuple):
         return units if is_plain_adam(self.optimizer, self.q_network.trainable_variables) else None
 
 
+class Actor(NamedTuple):
+    """A network that acts and does not learn."""
+
+    q_network: keras.Model
+
+    @property
+    def variables(self) -> list[keras.Variable]:
+        """The network's variables."""
+        return self.q_network.variables
+
+    def sizes(self) -> tuple[int, ...] | None:
+        """Returns the layer sizes if the package made the network; else None."""
+        return units_if_made_here(self.q_network)
+
+
 def stand_in(units: Sequence[int], jit_compile: bool) -> Learner:
     """Returns two new networks with these layer sizes, from states to actions, and a new Adam."""
     num_features, *hidden_units, num_actions = units
@@ -114,9 +129,9 @@ def shared_in(programs: dict) -> Iterator[None]:
 
 
 def bind(
-    make_function: Callable[[Learner, Sequence[tf.Variable]], Callable],
+    make_function: Callable[[Any, Sequence[tf.Variable]], Callable],
     specs: Sequence[tf.TensorSpec],
-    learner: Learner,
+    learner: Learner | Actor,
     variables: Sequence[tf.Variable] = (),
     *,
     key: Hashable,
@@ -128,7 +143,7 @@ def bind(
     Args:
         make_function: returns a function of tensors as in `specs`, given a learner and further variables.
         specs: shapes and dtypes of the arguments.
-        learner: the agent's networks and optimizer.
+        learner: the agent's networks and optimizer, or only a network that acts.
         variables: further tf.Variables that the function changes.
         key: distinguishes the functions that `make_function` can make for learners of the same sizes.
         has_own_parts: whether the function calls code of the user other than the learner. If so, it is traced again
@@ -147,7 +162,9 @@ def bind(
         key = (key, sizes, tuple(specs), tuple((v.shape, v.dtype) for v in variables), jit_compile)
         if key not in programs:
             extra = [tf.Variable(tf.zeros_like(v)) for v in variables]
-            programs[key] = _trace(make_function, specs, stand_in(sizes, jit_compile), extra, jit_compile)
+            model = stand_in(sizes, jit_compile)
+            replaced = model if isinstance(learner, Learner) else Actor(model.q_network)
+            programs[key] = _trace(make_function, specs, replaced, extra, jit_compile)
         program = programs[key]
     handles = _handles(learner, variables)
     captured = [handles[x] if isinstance(x, int) else x for x in program.captured]
@@ -156,7 +173,11 @@ def bind(
 
 
 def _trace_the_public_way(
-    make_function: Callable, specs: Sequence, learner: Learner, variables: Sequence[tf.Variable], jit_compile: bool
+    make_function: Callable,
+    specs: Sequence,
+    learner: Learner | Actor,
+    variables: Sequence[tf.Variable],
+    jit_compile: bool,
 ) -> Callable[..., list[tf.Tensor]]:
     concrete = _traced(make_function(learner, variables), specs, jit_compile)
     return _saying_what_xla_refused(lambda *tensors: tf.nest.flatten(concrete(*tensors)))
@@ -179,7 +200,11 @@ def _saying_what_xla_refused(call: Callable) -> Callable:
 
 
 def _trace(
-    make_function: Callable, specs: Sequence, learner: Learner, variables: Sequence[tf.Variable], jit_compile: bool
+    make_function: Callable,
+    specs: Sequence,
+    learner: Learner | Actor,
+    variables: Sequence[tf.Variable],
+    jit_compile: bool,
 ) -> _Program:
     """Traces the program on exactly these objects. If an equal program was compiled before, that one is used."""
     concrete = _traced(make_function(learner, variables), specs, jit_compile)
@@ -200,5 +225,5 @@ def _traced(function: Callable, specs: Sequence, jit_compile: bool) -> Any:
         ) from error
 
 
-def _handles(learner: Learner, variables: Sequence[tf.Variable]) -> list[tf.Tensor]:
+def _handles(learner: Learner | Actor, variables: Sequence[tf.Variable]) -> list[tf.Tensor]:
     return [handle(variable) for variable in (*learner.variables, *variables)]

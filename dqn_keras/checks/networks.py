@@ -75,7 +75,7 @@ def warn_of_inference_mode(network: keras.Model) -> None:
         warnings.warn(
             f"q_network is called in inference mode, also while it learns: {', '.join(names)} will not do there what "
             "model.fit would have it do",
-            stacklevel=4,
+            stacklevel=5,
         )
 
 

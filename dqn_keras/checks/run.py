@@ -58,17 +58,20 @@ def check_callbacks(
 
 def _check_evaluation(evaluation: Evaluation, env: gym.Env | FuncEnv) -> None:
     """Raises ValueError unless the evaluation has an environment of its own with the states and actions of `env`."""
-    if isinstance(env, gym.Env) and evaluation.env.unwrapped is env.unwrapped:
+    if isinstance(env, gym.Env) and isinstance(evaluation.env, gym.Env) and env.unwrapped is evaluation.env.unwrapped:
         raise ValueError(
             f"callbacks must evaluate in an environment of their own, got an Evaluation in env {env_name(env)} itself: "
             "make a second one"
         )
     wanted, got = (spaces._replace(first_action=0) for spaces in (spaces_of(env), evaluation.spaces))
     if got != wanted:
-        raise ValueError(f"callbacks must evaluate in an environment like env, {_sizes(wanted)}, got {_sizes(got)}")
+        raise ValueError(
+            f"callbacks must evaluate in an environment like env, {sizes_shown(wanted)}, got {sizes_shown(got)}"
+        )
 
 
-def _sizes(spaces: Spaces) -> str:
+def sizes_shown(spaces: Spaces) -> str:
+    """Returns the sizes of an environment's spaces for a message."""
     return f"with {spaces.state_dtype} states of shape {spaces.state_shape} and {spaces.num_actions} actions"
 
 
@@ -111,7 +114,7 @@ def check_own_parts(
         config_of_compile = arguments_of_compile(q_network)
         ignored = [x for x in _IGNORED if config_of_compile.get(x)]
         if ignored:
-            warnings.warn(f"{', '.join(ignored)} of q_network.compile are not used by train", stacklevel=3)
+            warnings.warn(f"{', '.join(ignored)} of q_network.compile are not used by train", stacklevel=4)
     formulas = Formulas(targets, "mse" if loss is None else loss)
     formulas.check()
     if (in_use := optimizer or owners) is not None:
@@ -140,5 +143,5 @@ def check_learning_rate(optimizer: keras.Optimizer, config: Config) -> None:
         warnings.warn(
             f"the learning rate of {optimizer.name!r} is a Python function, which is called once, when the learning "
             f"step is compiled: it stays at {rate}; a keras.optimizers.schedules.LearningRateSchedule would change",
-            stacklevel=4,
+            stacklevel=5,
         )

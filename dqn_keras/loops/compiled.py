@@ -147,7 +147,7 @@ def _bind_program(
 ) -> Callable[..., list[tf.Tensor]]:
     def make_program(learner: Learner, variables: Sequence[tf.Variable]) -> Callable:
         def play(*numbers: tf.Tensor) -> tuple[tf.Tensor, ...]:
-            return _Loop(env, spaces, config, formulas, learner, *variables, _Numbers(*numbers)).play()
+            return _Loop(env, spaces, config, formulas, learner, variables, _Numbers(*numbers)).play()
 
         return play
 
@@ -218,13 +218,12 @@ class _Loop:
         config: Config,
         formulas: Formulas,
         learner: Learner,
-        rows: tf.Variable,
-        num_appended: tf.Variable,
-        num_updates: tf.Variable,
+        variables: Sequence[tf.Variable],
         numbers: _Numbers,
     ) -> None:
         self._env, self._spaces, self._config, self._formulas, self._learner = env, spaces, config, formulas, learner
-        self._rows, self._num_appended, self._num_updates, self._numbers = rows, num_appended, num_updates, numbers
+        self._rows, self._num_appended, self._num_updates = variables
+        self._numbers = numbers
 
     def play(self) -> tuple[tf.Tensor, ...]:
         """Plays the episodes -> number of episodes played, the _Totals of each, the fault."""

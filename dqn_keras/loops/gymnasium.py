@@ -45,7 +45,8 @@ def _play_episode(env: CheckedEnv, agent: Agent, config: Config, q: "_InNumPy | 
     q.read_weights()
 
     state = env.reset(episode_seed(agent.seed, number), number)
-    for t in range(min(config.max_steps, (config.num_steps or math.inf) - first_step)):
+    most_steps = config.max_steps if config.num_steps is None else config.num_steps - first_step
+    for t in range(min(config.max_steps, most_steps)):
         a = epsilon_greedy(q.values(state), epsilon_at(first_step + t, epsilon, config), agent.rng)
         next_state, reward, terminated, truncated = env.step(a)
         memory.append_unchecked(Experience(state, a, reward, next_state, terminated))

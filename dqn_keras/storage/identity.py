@@ -29,11 +29,6 @@ class Identity(NamedTuple):
     """Variables outside the agent that the user's parts read or change. They belong to the state of a run."""
 
 
-def identity_of_study(env: gym.Env | FuncEnv, config: Config) -> dict[str, Any]:
-    """Returns what must be the same for a saved study to continue; versions may differ."""
-    return _facts(config, env=describe(env)[0])
-
-
 def identity(
     env: gym.Env | FuncEnv,
     config: Config,
@@ -71,6 +66,11 @@ def identity(
             parts[name] = Part(words_for(part))
     others = {id(variable): variable for x in computations for variable in x.other_variables}
     return Identity(_facts(config, **parts), list(others.values()))
+
+
+def identity_with(facts: dict[str, Any], **parts: Part) -> dict[str, Any]:
+    """Returns an identity's facts with further parts."""
+    return {**facts, "parts": facts["parts"] | json.loads(json.dumps({k: x._asdict() for k, x in parts.items()}))}
 
 
 def _facts(config: Config, **parts: Part) -> dict[str, Any]:
@@ -120,7 +120,9 @@ MAY_CHANGE_ON_RESUME = ("num_episodes",)
 """The fields of Config that may differ when a run is resumed. Never compared: callbacks, checkpoint_every, verbose."""
 
 
-def check_is_same(path: Path, theirs: dict[str, Any], ours: dict[str, Any], may_change: Sequence[str] = ()) -> None:
+def check_is_same(
+    path: Path | str, theirs: dict[str, Any], ours: dict[str, Any], may_change: Sequence[str] = ()
+) -> None:
     """Raises ValueError if `path` is from another run; the message begins with the argument or field that differs.
 
     The seeds are compared if `ours` has one.

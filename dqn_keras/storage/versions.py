@@ -20,7 +20,7 @@ def versions() -> dict[str, str]:
     return {"dqn_keras": __version__, "python": platform.python_version(), **versions, "processor": processor()}
 
 
-def warn_of_other_versions(path: Path, theirs: dict[str, Any], ours: dict[str, Any], stacklevel: int) -> None:
+def warn_of_other_versions(path: Path | str, theirs: dict[str, Any], ours: dict[str, Any], stacklevel: int) -> None:
     """Gives one warning that names all versions that differ."""
     theirs, ours = theirs["versions"], ours["versions"]
     others = [f"{name} {theirs.get(name)} (here {ours[name]})" for name in ours if theirs.get(name) != ours[name]]
