@@ -8,7 +8,7 @@ import dqn_keras
 from dqn_keras import Run
 from tests.helpers.fuzz import CASES, DOORS, Door, fuzz, in_its_own_folder, number, outcome, quiet_folder
 
-RECORDS = {"Agent", "Episode", "Experience", "Run", "Study", "TrainingInterrupted"}  # made by the package
+RECORDS = {"Agent", "Episode", "Experience", "Run", "Study", "Sweep", "TrainingInterrupted"}  # made by the package
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+import math
 import os
 import re
 import sys
@@ -127,14 +128,20 @@ def test_crafted_archives_are_refused(content, message):
         from_bytes(content)
 
 
+def outcome(seed, solved_at, digest="ab" * 32, greedy_return=math.nan, seconds=1.0):
+    """A seed's entry in the file of a study."""
+    return seed, solved_at, greedy_return, seconds, digest
+
+
 def study_file(path, **changes):
     """Writes a study of two seeds of 60 episodes, with these changes of its columns and facts."""
     config = {**vars(Config(num_episodes=60)), "hidden_units": [64]}
     columns = {f"{seed}/rewards": np.ones(60) for seed in (0, 1)} | {f"{seed}/steps": np.full(60, 7) for seed in (0, 1)}
-    facts = {"format": FORMAT, "config": config, "seeds": [(0, 55, "ab" * 32), (1, None, "ab" * 32)]}
+    setting = {"name": "", "config": config, "seeds": [outcome(0, 55), outcome(1, None)]}
     for name, value in changes.items():
-        (columns if "/" in name else facts)[name] = value
-    path.write_bytes(to_bytes(columns, facts))
+        (columns if "/" in name else setting)[name] = value
+    columns = {f"0/{name}": column for name, column in columns.items()}
+    path.write_bytes(to_bytes(columns, {"format": FORMAT, "settings": [setting]} | changes.get("facts", {})))
     return path
 
 
@@ -154,13 +161,22 @@ def test_a_sound_study_file_is_loaded(tmp_path):
         {"0/steps": np.full(60, -1)},
         {"0/steps": np.full(60, 1.5)},
         {"0/steps": np.ones(61, int), "0/rewards": np.ones(61)},
-        {"seeds": [(0, 10**9, "ab" * 32)]},
-        {"seeds": [(0, 1.5, "ab" * 32)]},
-        {"seeds": [(-1, None, "ab" * 32)]},
-        {"seeds": [(0, None, "ab" * 32), (0, None, "ab" * 32)]},
-        {"seeds": [(0, None, "no hex")]},
-        {"seeds": [(0, None, 7)]},
-        {"seeds": [(2, None, "ab" * 32)]},
+        {"seeds": [outcome(0, 10**9)]},
+        {"seeds": [outcome(0, 1.5)]},
+        {"seeds": [outcome(-1, None)]},
+        {"seeds": [outcome(0, None), outcome(0, None)]},
+        {"seeds": [outcome(0, None, "no hex")]},
+        {"seeds": [outcome(0, None, 7)]},
+        {"seeds": [outcome(2, None)]},
+        {"seeds": [outcome(0, None, greedy_return=math.inf)]},
+        {"seeds": [outcome(0, None, greedy_return="much")]},
+        {"seeds": [outcome(0, None, seconds=-1)]},
+        {"seeds": [outcome(0, None)[:4]]},
+        {"name": 7},
+        {"name": None},
+        {"facts": {"settings": None}},
+        {"facts": {"settings": [7]}},
+        {"facts": {"settings": [{}]}},
         {"seeds": [0]},
         {"seeds": None},
         {"config": {}},

@@ -16,14 +16,13 @@ import psutil
 import pytest
 from scipy import stats
 
-from dqn_keras import Config, Study, compare, episode_seed, load_study, plot_study, study, summarize, train
+from dqn_keras import Config, Study, compare, episode_seed, load_study, plot_study, study, summarize, train, workers
 from dqn_keras.environments import CartPole
-from dqn_keras.study import Outcome
+from dqn_keras.metrics import Outcome
 from tests.helpers.environments import Corridor
 from tests.helpers.faults import failing
 from tests.helpers.processes import killed_after
 
-module = importlib.import_module("dqn_keras.study")  # `dqn_keras.study` is the function
 QUICK = Config(num_episodes=30, batch_size=16, solved_reward=1000)
 
 
@@ -94,13 +93,13 @@ def test_a_change_that_workers_cannot_see_is_refused(monkeypatch):
 @pytest.fixture
 def trained(monkeypatch):
     """The seeds that are trained, in this process."""
-    seeds, train_seed = [], module._train_seed
+    seeds, train_seed = [], workers._train_seed
 
-    def note_and_train(env_copy, config, seed):
+    def note_and_train(setting, seed):
         seeds.append(seed)
-        return train_seed(env_copy, config, seed)
+        return train_seed(setting, seed)
 
-    monkeypatch.setattr(module, "_train_seed", note_and_train)
+    monkeypatch.setattr(workers, "_train_seed", note_and_train)
     return seeds
 
 
@@ -130,15 +129,15 @@ def test_a_second_study_is_refused_while_one_writes_the_file(tmp_path, trained):
     refused = []
 
     def try_to_join(outcomes):
-        for outcome in outcomes:
+        for task, outcome in outcomes:
             with pytest.raises(ValueError, match=r"^file .*study\.npz is in use: another process or thread"):
                 study(CartPole(), QUICK, [7], file=tmp_path / "study.npz", num_workers=1, verbose=0)
             refused.append(outcome.seed)
-            yield outcome
+            yield task, outcome
 
-    engines = {"joblib": lambda *arguments: try_to_join(module._by_joblib(*arguments))}
+    by_joblib = workers.ENGINES["joblib"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "_ENGINES", engines)
+        patch.setitem(workers.ENGINES, "joblib", lambda *arguments: try_to_join(by_joblib(*arguments)))
         study(CartPole(), QUICK, range(2), file=tmp_path / "study.npz", num_workers=1, verbose=0)
     assert refused == trained == [0, 1]
     assert len(study(CartPole(), QUICK, [7], file=tmp_path / "study.npz", num_workers=1, verbose=0).outcomes) == 1
@@ -163,15 +162,15 @@ def test_a_file_that_cannot_be_written_at_the_end_loses_nothing_but_the_file(tmp
 
 
 def test_an_interrupted_run_in_this_process_ends_the_study_with_what_is_finished(tmp_path, monkeypatch, trained):
-    file, train_seed = tmp_path / "study.npz", module._train_seed
+    file, train, long = tmp_path / "study.npz", workers.train, dataclasses.replace(QUICK, num_episodes=10**6)
 
-    def interrupted_in_the_third(env_copy, config, seed):
-        if seed == 2 and len(trained) == 2:
+    def interrupted_in_the_third(env, config, seed, **others):
+        if seed == 2 and len(trained) == 3:
             threading.Timer(0.05, signal.raise_signal, [signal.SIGINT]).start()
-            config = dataclasses.replace(config, num_episodes=10**6)
-        return train_seed(env_copy, config, seed)
+            config = long
+        return train(env, config, seed, **others)
 
-    monkeypatch.setattr(module, "_train_seed", interrupted_in_the_third)
+    monkeypatch.setattr(workers, "train", interrupted_in_the_third)
     with pytest.warns(UserWarning, match=r"^3 of 5 seeds are not in this study: it was interrupted"):
         kept = study(CartPole(), QUICK, range(5), file=file, num_workers=1, verbose=0)
     assert kept.seeds.tolist() == load_study(file).seeds.tolist() == [0, 1]
@@ -180,12 +179,12 @@ def test_an_interrupted_run_in_this_process_ends_the_study_with_what_is_finished
 
 
 STUDY = """
-import contextlib, importlib, sys
+import contextlib, sys
 import gymnasium as gym
-from dqn_keras import Config, study
-module = importlib.import_module("dqn_keras.study")
-module._SECONDS_BETWEEN_SAVES = 0
-ignored, save = module._interrupts_ignored_by_children, module._save
+from dqn_keras import Config, study, workers
+from dqn_keras.storage import studies
+studies.SECONDS_BETWEEN_SAVES = 0
+ignored, save = workers._interrupts_ignored_by_children, studies._save
 
 @contextlib.contextmanager
 def ignored_and_said():
@@ -197,7 +196,7 @@ def save_and_say(path, outcomes, facts):
     save(path, outcomes, facts)
     print("saved", len(outcomes), flush=True)
 
-module._interrupts_ignored_by_children, module._save = ignored_and_said, save_and_say
+workers._interrupts_ignored_by_children, studies._save = ignored_and_said, save_and_say
 config = Config(num_episodes=100, solved_reward=1000)
 outcome = study(gym.make("CartPole-v1"), config, range(10_000), file=sys.argv[1], num_workers=2, verbose=0)
 print("kept", len(outcome.seeds), flush=True)
@@ -336,7 +335,8 @@ def test_a_cluster_of_two_nodes_loses_a_worker_and_the_numbers_are_the_same(monk
 def made_up(*solved_at):
     """A study of which only the episodes to solved matter."""
     outcomes = [
-        Outcome(k, np.full(k + 60, 10.0 * k), np.full(k + 60, 10), at, bytes(32)) for k, at in enumerate(solved_at)
+        Outcome(k, np.full(k + 60, 10.0 * k), np.full(k + 60, 10), at, np.nan, 1.0, bytes(32))
+        for k, at in enumerate(solved_at)
     ]
     return Study(Config(), outcomes)
 

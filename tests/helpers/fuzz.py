@@ -73,6 +73,7 @@ def shared() -> dict[str, Any]:
         "adam": keras.optimizers.Adam(),
         "run": dqn_keras.train(Corridor(3, 3), QUICK, 0, verbose=0),
         "study": dqn_keras.study(Corridor(3, 3), QUICK, range(2), num_workers=1, verbose=0),
+        "sweep": dqn_keras.sweep(Corridor(3, 3), {"a": QUICK}, range(2), num_workers=1, verbose=0),
     }
 
 
@@ -212,6 +213,7 @@ POOL: dict[str, Callable[[], Any]] = {
     "a Config as a dictionary": lambda: dataclasses.asdict(QUICK),
     "a Run": lambda: shared()["run"],
     "a Study": lambda: shared()["study"],
+    "a Sweep": lambda: shared()["sweep"],
     "a Study of no seeds": lambda: dqn_keras.Study(QUICK, []),
     "an Experience of None": lambda: Experience(*[None] * 5),
     "five strings": lambda: ["x"] * 5,
@@ -536,20 +538,28 @@ def picture_doors() -> Iterator[tuple[str, Door]]:
         "plot_study",
         Door(
             dqn_keras.plot_study,
-            lambda: {"study": shared()["study"], "axes": None, "published": 2},
+            lambda: {"study": shared()["study"], "axes": None, "published": 2, "x": "episodes"},
             {
                 "study": named("a Study"),
                 "axes": named("None", "three Axes"),
                 "published": one_of(no_value, number(0, 1e100)),
+                "x": nothing,
             },
         ),
     )
+    sweep = {"sweep": named("a Sweep"), "late_after": count()}
+    for function in (dqn_keras.plot_sweep, dqn_keras.sweep_table):
+        yield function.__name__, Door(function, lambda: {"sweep": shared()["sweep"], "late_after": 9}, sweep)
 
 
 def many_seeds_doors() -> Iterator[tuple[str, Door]]:
     yield (
         "summarize",
-        Door(dqn_keras.summarize, lambda: {"study": shared()["study"]}, {"study": named("a Study")}),
+        Door(
+            dqn_keras.summarize,
+            lambda: {"study": shared()["study"], "late_after": 9},
+            {"study": named("a Study"), "late_after": count()},
+        ),
     )
     yield (
         "compare",
@@ -559,23 +569,32 @@ def many_seeds_doors() -> Iterator[tuple[str, Door]]:
             {"first": named("a Study"), "second": named("a Study")},
         ),
     )
+    how = {"seeds": range(1), "file": None, "engine": "joblib", "num_workers": 1, "verbose": 0, "evaluate_on": None}
+    claims = {
+        "env": is_a(Corridor, CartPole),
+        "seeds": named("()", "range(0, 0)", "zeros(0)", "[1, 2]"),
+        "file": one_of(no_value, lambda x: path(x) and x != Path("")),
+        "engine": nothing,
+        "num_workers": one_of(no_value, count()),
+        "verbose": named("0", "1", "True", "False", "int64(2)", "np.True_"),
+        "evaluate_on": one_of(no_value, is_a(Corridor)),
+    }
+    own = {"q_network": None, "optimizer": None, "loss": None}
+    parts = {"q_network": no_value, "optimizer": no_value, "targets": nothing, "loss": named("None", "a loss")}
     yield (
         "study",
         Door(
             dqn_keras.study,
-            lambda: {
-                **{"env": Corridor(3, 3), "config": QUICK, "seeds": range(1), "file": None},
-                **{"engine": "joblib", "num_workers": 1, "verbose": 0},
-            },
-            {
-                "env": is_a(Corridor, CartPole),
-                "config": is_a(Config),
-                "seeds": named("()", "range(0, 0)", "zeros(0)", "[1, 2]"),
-                "file": one_of(no_value, lambda x: path(x) and x != Path("")),
-                "engine": nothing,
-                "num_workers": one_of(no_value, count()),
-                "verbose": named("0", "1", "True", "False", "int64(2)", "np.True_"),
-            },
+            lambda: {"env": Corridor(3, 3), "config": QUICK, **how, **own},
+            {**claims, **parts, "config": is_a(Config)},
+        ),
+    )
+    yield (
+        "sweep",
+        Door(
+            dqn_keras.sweep,
+            lambda: {"env": Corridor(3, 3), "settings": {"a": QUICK}, **how},
+            {**claims, "settings": nothing},
         ),
     )
 
@@ -589,6 +608,7 @@ def file_doors() -> Iterator[tuple[str, Door]]:
         Door(dqn_keras.load_q_network, lambda: {"path": "../network.keras"}, {"path": nothing}),
     )
     yield "load_study", Door(dqn_keras.load_study, lambda: {"path": "../study.npz"}, {"path": nothing})
+    yield "load_sweep", Door(dqn_keras.load_sweep, lambda: {"path": "../study.npz"}, {"path": nothing})
     yield "Run.save", Door(save, lambda: {"path": "x.keras"}, {"path": nothing})
 
 
@@ -614,10 +634,12 @@ def train_doors() -> Iterator[tuple[str, Door]]:
 
 def config_doors() -> Iterator[tuple[str, Door]]:
     names = ("memory_size", "steps_per_update", "batch_size", "num_episodes", "max_steps", "solved_window")
-    claims = {name: count() for name in names}
+    claims = {name: count() for name in (*names, "gradient_steps", "gradient_steps_per_target")}
+    claims |= {name: one_of(no_value, count()) for name in ("num_steps", "epsilon_steps")}
+    claims |= {"learning_starts": count(0), "steps_count_from": nothing}
     claims |= {name: number(0, 1, above=True) for name in ("alpha", "tau", "decay")}
     claims |= {name: number(0, 1) for name in ("gamma", "epsilon", "epsilon_min")}
-    claims |= {"solved_reward": number(-INF, INF), "hidden_units": counts(), "jit_compile": flag}
+    claims |= {"solved_reward": one_of(no_value, number(-INF, INF)), "hidden_units": counts(), "jit_compile": flag}
     also = dict.fromkeys(claims, "batch_size epsilon_min")
     arguments = lambda: {"memory_size": 4, "batch_size": 1, "max_steps": 3, "epsilon_min": 0.0}  # noqa: E731
     yield "Config", Door(Config, arguments, claims, also)
