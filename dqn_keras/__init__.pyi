@@ -18,6 +18,7 @@ from .plotting import plot_study as plot_study
 from .plotting import plot_sweep as plot_sweep
 from .policy import action as action
 from .policy import decay_epsilon as decay_epsilon
+from .presets import presets as presets
 from .rendering import animate as animate
 from .rendering import record_episode as record_episode
 from .rendering import save_animation as save_animation

@@ -1,6 +1,7 @@
 """The command line, as a user types it."""
 
 import csv
+import dataclasses
 import json
 import os
 import shlex
@@ -17,7 +18,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dqn_keras import Config, evaluate, load_q_network, load_study, train
+from dqn_keras import (
+    Config,
+    double_td_targets,
+    evaluate,
+    load_q_network,
+    load_study,
+    load_sweep,
+    presets,
+    train,
+)
 from dqn_keras.cli.options import main
 from dqn_keras.environments import CartPole
 from tests.helpers.processes import killed_after
@@ -161,6 +171,40 @@ def test_a_study_is_kept_gone_on_with_and_drawn(capsys):
 
 
 @pytest.mark.slow
+def test_a_sweep_is_kept_gone_on_with_and_drawn(capsys):
+    line = "sweep CartPole-v1 --compiled --out s --workers 1 --num-episodes 60 --evaluate --quiet"
+    assert dqn_keras(f"{line} --vary hidden_units=8,8x8 double=False,True --seeds 1") == 0
+    table = capsys.readouterr().out
+    names = [f"hidden_units={units} double={double}" for units in ("8", "8x8") for double in (False, True)]
+    assert all(f"| {name} | 1 |" in table for name in names)
+    kept = load_sweep("s/sweep.npz")
+    assert [kept[name].config.hidden_units for name in names] == [(8,), (8,), (8, 8), (8, 8)]
+    assert len({study.outcomes[0].digest for study in kept.values()}) == 4
+    assert np.isfinite(kept[names[0]].greedy_returns).all()
+    rows = list(csv.DictReader(Path("s/sweep.csv").open()))
+    assert [(row["setting"], row["seed"]) for row in rows] == [(name, "0") for name in names]
+    Path("s/sweep.png").unlink()
+    assert dqn_keras("plot s") == 0
+    assert Path("s/sweep.png").exists()
+
+
+@pytest.mark.slow
+def test_formulas_and_presets_of_a_run_are_kept_for_its_resume():
+    line = f"train CartPole-v1 --seed 3 --preset --tau 0.01 --double --loss huber {SHORT} --out"
+    assert dqn_keras(f"{line} run") == 0
+    kept = json.loads(Path("run/config.json").read_text())
+    assert (kept["double"], kept["loss"], kept["config"]["tau"], kept["config"]["gamma"]) == (True, "huber", 0.01, 0.99)
+    assert dqn_keras("resume run --num-episodes 20 --quiet") == 0
+    dqn_keras(f"{line} whole --num-episodes 20")
+    own = {"targets": double_td_targets, "loss": "huber"}
+    config = dataclasses.replace(presets["CartPole-v1"], tau=0.01, num_episodes=20, batch_size=16, solved_reward=1000)
+    run = train(gym.make("CartPole-v1"), config, 3, **own, verbose=0)
+    for folder in ("run", "whole"):
+        for a, b in zip(load_q_network(f"{folder}/agent.keras").weights, run.q_network.weights, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.slow
 def test_a_longer_run_is_the_run_that_had_been_longer_from_the_start():
     dqn_keras(f"train CartPole-v1 --seed 3 --out whole {SHORT}")
     dqn_keras(f"train CartPole-v1 --seed 3 --out parts {SHORT} --num-episodes 7")
@@ -224,6 +268,15 @@ ERRORS = {
     "study CartPole-v1 --num-episodes 20": "num_episodes must be at least solved_window=50 in a study",
     "train LunarLander-v3 --compiled": "compiled episodes are for CartPole-v1, Acrobot-v1, MountainCar-v0 as they are",
     "train CartPole-v1 --seed -1": "seed must be a whole number from 0",
+    "train CartPole-v1 --loss hubr": "loss must be a name that Keras knows, such as 'mse', got 'hubr'",
+    "train Nope-v1 --preset": "preset is there for CartPole-v1",
+    "train CartPole-v1 --preset --tau 7": "tau must be a finite number above 0, at most 1, got 7.0",
+    "train CartPole-v1 --steps-count-from run --num-steps 10": "batch_size must be at most num_steps = 10, got 64",
+    "sweep CartPole-v1 --vary tua=0.1": "vary must be of the form NAME=VALUE,VALUE with a name of --help, got 'tua=0.1'",
+    "sweep CartPole-v1 --vary tau": "vary must be of the form NAME=VALUE,VALUE with a name of --help, got 'tau'",
+    "sweep CartPole-v1 --vary tau=0.1,x": "tau must be a finite number above 0, at most 1, got 'x'",
+    "sweep CartPole-v1 --vary loss=mse,x": "settings['loss=x']: loss must be a name that Keras knows",
+    "sweep CartPole-v1 --vary double=1": "double must be True or False, got 1",
     "study CartPole-v1 --seeds 0": "seeds must be a whole number from 1",
     "resume nowhere": "nowhere holds no run: there is no config.json in it",
     "evaluate nowhere": "nowhere holds no run",
@@ -251,8 +304,9 @@ USAGE_ERRORS = {
         "Share of Q that is mixed into Q-hat",
     ),
     "train": ("Missing from dqn-keras train", "ENV"),
-    "fly": ("Unrecognized options: fly", "train, resume, watch, evaluate, study, plot"),
-    "": ("Expected one of {train, resume, watch, evaluate, study, plot}.",),
+    "fly": ("Unrecognized options: fly", "train, resume, watch, evaluate, study, sweep, plot"),
+    "": ("Expected one of {train, resume, watch, evaluate, study, sweep, plot}.",),
+    "sweep CartPole-v1": ("Missing from dqn-keras sweep", "--vary"),
 }
 
 

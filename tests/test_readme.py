@@ -24,7 +24,7 @@ def test_the_readmes_scripts_run(script):
 
 def test_the_readmes_commands_are_ones():
     commands = re.findall(r"^dqn-keras (.*)$", README, re.MULTILINE)
-    assert len(commands) == 5
+    assert len(commands) == 6
     for command in commands:
         parse(shlex.split(command))
 

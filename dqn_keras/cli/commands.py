@@ -4,7 +4,7 @@ import contextlib
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,11 +12,14 @@ from dqn_keras.checks.numbers import check_count
 from dqn_keras.cli import run_folder
 from dqn_keras.cli.options import how_to_resume
 from dqn_keras.cli.run_folder import EnvOptions, Settings
+from dqn_keras.cli.vary import varied
 from dqn_keras.evaluation import evaluate as play_greedily
 from dqn_keras.rendering import record_episode, save_animation
 from dqn_keras.seeding import checked_seed
-from dqn_keras.statistics import summarize
+from dqn_keras.statistics import summarize, sweep_table
+from dqn_keras.study import load_sweep
 from dqn_keras.study import study as train_seeds
+from dqn_keras.study import sweep as sweep_settings
 from dqn_keras.training import Run
 
 if TYPE_CHECKING:
@@ -27,7 +30,7 @@ def train(options: "cli.Train") -> int:
     """Trains an agent in a new folder."""
     seed = checked_seed(options.seed)
     folder = options.out or _default_folder(options.env, str(seed))
-    settings = Settings(_env_options(options), seed, options.config, options.tensorboard)
+    settings = Settings(_env_options(options), seed, options.config, options.tensorboard, options.double, options.loss)
     return _tell(run_folder.begin(folder, settings, _verbosity(options.quiet)), folder, options)
 
 
@@ -74,21 +77,42 @@ def study(options: "cli.Study") -> int:
             f"num_episodes must be at least solved_window={options.config.solved_window} in a study, whose curves are "
             f"means over it, got {options.config.num_episodes}"
         )
-    trained = train_seeds(
-        _env_options(options).make_for_training(),
-        options.config,
-        range(check_count("seeds", options.seeds)),
-        file=folder / "study.npz",
-        num_workers=options.workers,
-        verbose=0 if options.quiet else 1,
-    )
+    own = run_folder.own_formulas(options.double, options.loss)
+    trained = train_seeds(_make_env(options), options.config, **own, **_how(options), file=folder / "study.npz")
     if len(trained.outcomes) < options.seeds:
         return _interrupted("the same command again")
+    run_folder.write_columns(folder / "study.csv", trained.to_dict())
     summary = summarize(trained)
-    print(f"Share of seeds solved within {options.config.num_episodes:,} episodes: {summary.share_solved}")
-    print(f"Episodes to solved: median {summary.median}, mean of the middle half {summary.interquartile_mean}")
+    if options.config.solved_reward is not None:
+        print(f"Share of seeds solved within {options.config.num_episodes:,} episodes: {summary.share_solved}")
+        print(f"Episodes to solved: median {summary.median}, mean of the middle half {summary.interquartile_mean}")
+    if options.evaluate:
+        print(f"Mean return of 100 greedy episodes, mean over the seeds: {summary.greedy_return}")
     print(f"The numbers in brackets are 95 % intervals; the curves are in {run_folder.draw(folder)}")
     return 0
+
+
+def sweep(options: "cli.Sweep") -> int:
+    """Trains many seeds of several settings and prints a table."""
+    folder = options.out or _default_folder(options.env, "sweep")
+    settings = varied(options.config, options.vary, {"double": options.double, "loss": options.loss})
+    trained = sweep_settings(_make_env(options), settings, **_how(options), file=folder / "sweep.npz")
+    if any(len(one.outcomes) < options.seeds for one in trained.values()):
+        return _interrupted("the same command again")
+    run_folder.write_columns(folder / "sweep.csv", load_sweep(folder / "sweep.npz").to_dict())
+    print(sweep_table(trained))
+    print(f"In brackets: 95 % intervals. Late: after episode 500. The picture is in {run_folder.draw(folder)}")
+    return 0
+
+
+def _how(options: "cli.Study | cli.Sweep") -> dict[str, Any]:
+    """Returns the arguments that `study` and `sweep` share."""
+    return {
+        "seeds": range(check_count("seeds", options.seeds)),
+        "evaluate_on": _make_env(options) if options.evaluate else None,
+        "num_workers": options.workers,
+        "verbose": 0 if options.quiet else 1,
+    }
 
 
 def plot(options: "cli.Plot") -> int:
@@ -97,8 +121,13 @@ def plot(options: "cli.Plot") -> int:
     return 0
 
 
-def _env_options(options: "cli.Train | cli.Study") -> EnvOptions:
+def _env_options(options: "cli.Train | cli.Study | cli.Sweep") -> EnvOptions:
     return EnvOptions.parse(options.env, options.env_args, options.flatten, options.compiled)
+
+
+def _make_env(options: "cli.Study | cli.Sweep") -> Any:
+    """Makes the environment to train in."""
+    return _env_options(options).make_for_training()
 
 
 def _default_folder(env_id: str, name: str) -> Path:

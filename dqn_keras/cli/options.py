@@ -55,6 +55,12 @@ class _Task:
     compiled: Flag = False
     """Compile whole episodes. This takes seconds; training is then about ten times as fast.
     Only for CartPole-v1, Acrobot-v1 and MountainCar-v0, which have a functional twin."""
+    preset: Flag = False
+    """Start from parameters that are known to solve ENV, not from the original's; typed ones replace them."""
+    double: Flag = False
+    """Use the targets of Double DQN."""
+    loss: Annotated[str, arg(metavar="NAME")] = "mse"
+    """Name of a Keras loss, such as mse, huber or mae."""
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -122,14 +128,13 @@ class Evaluate(_Kept):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Study(_Task):
-    """Train an agent for each of many seeds, on all cores, to see how reliable it is."""
+class _ManySeeds(_Task):
+    """An environment, how to learn it, and with which seeds."""
 
     seeds: int = 100
     """Number of seeds; they are 0, 1, 2, ..."""
-    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: runs/ENV-study)")] = None
-    """Folder for the study: study.npz and study.png.
-    If you repeat the command, it trains only the missing seeds."""
+    evaluate: Flag = False
+    """Let each trained agent play 100 greedy episodes."""
     workers: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: one for each core)")] = None
     """Number of processes."""
     quiet: Flag = False
@@ -137,16 +142,37 @@ class Study(_Task):
 
 
 @dataclasses.dataclass(kw_only=True)
+class Study(_ManySeeds):
+    """Train an agent for each of many seeds, on all cores, to see how reliable it is."""
+
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: runs/ENV-study)")] = None
+    """Folder for the study: study.npz, study.csv (a line for each seed) and study.png.
+    If you repeat the command, it trains only the missing seeds."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Sweep(_ManySeeds):
+    """Make a study of each of several settings, to see which is better."""
+
+    vary: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE,VALUE ...")]
+    """Parameters to vary, and their values, such as tau=0.01,0.05 hidden_units=64,128x128 loss=mse,huber.
+    All combinations are trained."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: runs/ENV-sweep)")] = None
+    """Folder for the sweep: sweep.npz, sweep.csv (a line for each seed) and sweep.png.
+    If you repeat the command, it trains only what is missing; other values are added."""
+
+
+@dataclasses.dataclass(kw_only=True)
 class Plot:
-    """Draw the curves of a study or a run, even while the run is in progress."""
+    """Draw the picture of a study, a sweep or a run, even while it is in progress."""
 
     folder: Folder
-    """Folder of the run or the study; the picture is written there, as curve.png or study.png."""
+    """Folder of the run, the study or the sweep; the picture is written there: curve.png, study.png or sweep.png."""
 
 
 def parse(arguments: Sequence[str]) -> Any:
     """Returns the command with its options, checked. After the help or an error, tyro raises SystemExit."""
-    commands: Any = Train | Resume | Watch | Evaluate | Study | Plot
+    commands: Any = Train | Resume | Watch | Evaluate | Study | Sweep | Plot
     description = "Train Deep Q-Networks on Gymnasium's environments."
     try:
         command = tyro.cli(commands, prog="dqn-keras", description=description, args=arguments)
@@ -155,13 +181,28 @@ def parse(arguments: Sequence[str]) -> Any:
             print(f"dqn-keras: {hint}", file=sys.stderr)
         raise
     if isinstance(command, _Task):
-        command.config = cast(Any, Config(**vars(command.config)))
+        fields = vars(command.config)
+        if command.preset:
+            typed = {word.partition("=")[0].removeprefix("--").replace("-", "_") for word in arguments}
+            typed = {name.removeprefix("no_") for name in typed}
+            fields = {name: x for name, x in fields.items() if name in typed}
+            command.config = cast(Any, dataclasses.replace(_preset(command.env), **fields))
+        else:
+            command.config = cast(Any, Config(**fields))
     return command
+
+
+def _preset(env: str) -> Config:
+    from dqn_keras.presets import presets
+
+    if env not in presets:
+        raise ValueError(f"preset is there for {', '.join(presets)}, got {env}")
+    return presets[env]
 
 
 def _hint(arguments: Sequence[str]) -> str | None:
     """Returns what to write instead of a common slip in arguments that cannot be read."""
-    names = [command.__name__.lower() for command in (Train, Resume, Watch, Evaluate, Study, Plot)]
+    names = [command.__name__.lower() for command in (Train, Resume, Watch, Evaluate, Study, Sweep, Plot)]
     if not arguments:
         return None
     if arguments[0] not in names:

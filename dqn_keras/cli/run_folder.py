@@ -7,24 +7,26 @@ import dataclasses
 import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import matplotlib.pyplot as plt
+import numpy as np
 
 from dqn_keras import environments
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.checks.environments import can_flatten, check_environment, way_to_a_box
 from dqn_keras.config import Config
 from dqn_keras.interruption import TrainingInterrupted
+from dqn_keras.learn import double_td_targets, td_targets
 from dqn_keras.metrics import LOGGED
-from dqn_keras.plotting import plot_history, plot_study
+from dqn_keras.plotting import plot_history, plot_study, plot_sweep
 from dqn_keras.storage.files import locked, replacing
 from dqn_keras.storage.networks import load_q_network
 from dqn_keras.storage.versions import versions
-from dqn_keras.study import load_study
+from dqn_keras.study import load_study, load_sweep
 from dqn_keras.training import Run, train
 
 
@@ -86,6 +88,13 @@ class Settings:
     seed: int
     config: Config
     tensorboard: bool
+    double: bool
+    loss: str
+
+
+def own_formulas(double: bool, loss: str) -> dict[str, Any]:
+    """Returns the targets and the loss as arguments of `train`."""
+    return {"targets": double_td_targets if double else td_targets, "loss": loss}
 
 
 def write_settings(folder: Path, settings: Settings) -> None:
@@ -95,6 +104,8 @@ def write_settings(folder: Path, settings: Settings) -> None:
         "seed": settings.seed,
         "config": dataclasses.asdict(settings.config),
         "tensorboard": settings.tensorboard,
+        "double": settings.double,
+        "loss": settings.loss,
         "versions": versions(),
     }
     with replacing(folder / "config.json") as temporary:
@@ -112,7 +123,8 @@ def read_settings(folder: Path) -> Settings:
         env = EnvOptions(**content["environment"])
         if not (isinstance(env.id, str) and isinstance(env.arguments, dict)):
             raise TypeError("the environment must have an id and arguments")
-        return Settings(env, content["seed"], Config(**config), content["tensorboard"])
+        names = ("tensorboard", "double", "loss")
+        return Settings(env, content["seed"], Config(**config), *(content[name] for name in names))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is not as `dqn-keras train` writes it: {error}") from None
 
@@ -190,6 +202,7 @@ def _train(folder: Path, env: Any, settings: Settings, verbose: int, resume: boo
             env,
             settings.config,
             settings.seed,
+            **own_formulas(settings.double, settings.loss),
             callbacks=callbacks,
             checkpoint=folder / "checkpoint",
             resume=resume,
@@ -212,6 +225,14 @@ def _write_log(log: Path, history: dict[str, list[float]]) -> None:
         writer.writerows(zip(itertools.count(), *(history[name] for name in names), strict=False))
 
 
+def write_columns(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Writes columns of equal length as a CSV file."""
+    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+
+
 def read_log(folder: Path) -> dict[str, list[float]]:
     """Returns log.csv in the form of `run.history`. An episode played twice, after a kill, counts with its last row."""
     rows: dict[int, dict[str, float]] = {}
@@ -224,8 +245,10 @@ def read_log(folder: Path) -> dict[str, list[float]]:
 
 
 def draw(folder: Path) -> Path:
-    """Draws study.png or curve.png from the files in the folder, and returns its path."""
-    if (folder / "study.npz").exists():
+    """Draws study.png, sweep.png or curve.png from the files in the folder, and returns its path."""
+    if (folder / "sweep.npz").exists():
+        axes, path = plot_sweep(load_sweep(folder / "sweep.npz")), folder / "sweep.png"
+    elif (folder / "study.npz").exists():
         axes, path = plot_study(load_study(folder / "study.npz"), published=None), folder / "study.png"
     else:
         config = read_settings(folder).config
