@@ -181,7 +181,8 @@ def test_a_sweep_is_kept_gone_on_with_and_drawn(capsys):
     assert [kept[name].config.hidden_units for name in names] == [(8,), (8,), (8, 8), (8, 8)]
     assert len({study.outcomes[0].digest for study in kept.values()}) == 4
     assert np.isfinite(kept[names[0]].greedy_returns).all()
-    rows = list(csv.DictReader(Path("s/sweep.csv").open()))
+    with Path("s/sweep.csv").open() as file:
+        rows = list(csv.DictReader(file))
     assert [(row["setting"], row["seed"]) for row in rows] == [(name, "0") for name in names]
     Path("s/sweep.png").unlink()
     assert dqn_keras("plot s") == 0
@@ -272,7 +273,7 @@ ERRORS = {
     "train Nope-v1 --preset": "preset is there for CartPole-v1",
     "train CartPole-v1 --preset --tau 7": "tau must be a finite number above 0, at most 1, got 7.0",
     "train CartPole-v1 --steps-count-from run --num-steps 10": "batch_size must be at most num_steps = 10, got 64",
-    "sweep CartPole-v1 --vary tua=0.1": "vary must be of the form NAME=VALUE,VALUE with a name of --help, got 'tua=0.1'",
+    "sweep CartPole-v1 --vary tua=1": "vary must be of the form NAME=VALUE,VALUE with a name of --help, got 'tua=1'",
     "sweep CartPole-v1 --vary tau": "vary must be of the form NAME=VALUE,VALUE with a name of --help, got 'tau'",
     "sweep CartPole-v1 --vary tau=0.1,x": "tau must be a finite number above 0, at most 1, got 'x'",
     "sweep CartPole-v1 --vary loss=mse,x": "settings['loss=x']: loss must be a name that Keras knows",

@@ -350,8 +350,11 @@ def test_a_summary_worked_out_by_hand():
     assert 0.5 < summary.share_solved.low < 7 / 8 < summary.share_solved.high < 1
     assert summary.median.value == 305
     assert summary.interquartile_mean.value == (290 + 300 + 310 + 320) / 4
-    for estimate in summary[1:]:
+    assert summary.share_late.value == 2 / 8
+    assert summarize(outcomes, late_after=300).share_late.value == 5 / 8
+    for estimate in summary[1:4]:
         assert estimate.low < estimate.value < estimate.high
+    assert np.isnan(summary.greedy_return.value)
     assert str(summary.median).startswith("305.0 (")
     assert repr(outcomes) == "<Study: 8 seeds, 7 solved>"
     assert np.isnan(outcomes.rewards[0, 60:]).all()
