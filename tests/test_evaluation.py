@@ -1,8 +1,14 @@
 import gymnasium as gym
+import keras
 import numpy as np
 import pytest
+import tensorflow as tf
+from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras import Config, evaluate, make_q_network, train
+from dqn_keras.environments import CartPole
+from dqn_keras.loops.draws import episode_key, reset_rng
+from dqn_keras.seeding import evaluation_key
 from tests.helpers.environments import Corridor
 
 
@@ -58,3 +64,77 @@ def test_bad_arguments_are_named(cartpole):
         evaluate(cartpole, make_q_network(4, 2), max_steps=1.5)
     with pytest.raises(ValueError, match="action space"):
         evaluate(gym.make("Pendulum-v1"), make_q_network(3, 2))
+
+
+def test_greedy_episodes_of_a_functional_environment_replayed_in_gymnasium_agree(cartpole):
+    network = train(CartPole(), Config(num_episodes=150), seed=0, verbose=0).q_network
+    returns = evaluate(CartPole(), network, 30, seed=4)
+    initial = tf.function(CartPole().initial, jit_compile=True)
+    replayed = []
+    for episode in range(30):
+        cartpole.reset(seed=0)
+        cartpole.unwrapped.state = initial(reset_rng(episode_key(evaluation_key(4), tf.constant(episode)))).numpy()
+        state, total, is_over = np.array(cartpole.unwrapped.state, np.float32), 0.0, False
+        while not is_over:
+            state, reward, terminated, truncated, _ = cartpole.step(int(network(state[None]).numpy().argmax()))
+            total, is_over = total + reward, terminated or truncated
+        replayed.append(total)
+    assert len(set(returns)) > 5
+    assert np.mean(returns == replayed) > 0.9  # the last bits of two Q-values may decide otherwise
+
+
+def test_functional_episodes_are_cut_by_max_steps_and_repeat():
+    network = make_q_network(4, 2, seed=0)
+    assert (evaluate(CartPole(), network, 5, seed=0, max_steps=3) == 3).all()
+    first, again, other = (evaluate(CartPole(), network, 20, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_a_network_and_an_environment_of_ones_own_are_evaluated_as_they_are():
+    own = keras.Sequential([keras.Input((1,)), keras.layers.Dense(2, activation="tanh")])
+    own.set_weights([np.zeros((1, 2)), np.array([0.0, 1.0])])  # always the action of index 1
+    assert evaluate(Paying(), own, 3, seed=0).tolist() == [6.0] * 3
+    Paying.amount = 2.0
+    assert evaluate(Paying(), own, 3, seed=0).tolist() == [12.0] * 3
+    own.set_weights([np.zeros((1, 2)), np.array([1.0, 0.0])])
+    assert evaluate(Paying(), own, 3, seed=0, max_steps=9).tolist() == [0.0] * 3
+
+
+class Paying(FuncEnv):
+    """Pays `amount` for action 8 and ends after 6 of them; the actions are 7 and 8."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gym.spaces.Discrete(2, start=7)
+    amount = 1.0
+
+    def initial(self, rng, params=None):
+        return tf.constant(0.0)
+
+    def transition(self, state, action, rng, params=None):
+        return state + tf.cast(action == 8, tf.float32)
+
+    def observation(self, state, rng, params=None):
+        return state[None]
+
+    def reward(self, state, action, next_state, rng, params=None):
+        return self.amount * tf.cast(action == 8, tf.float32)
+
+    def terminal(self, state, rng, params=None):
+        return state >= 6
+
+
+class Bad(Paying):
+    def observation(self, state, rng, params=None):
+        return tf.where(state >= 2, np.nan, state)[None]
+
+
+def test_a_bad_number_of_a_functional_environment_says_where():
+    with pytest.raises(ValueError, match=r"^env Bad: an observation or a reward was not finite in episode 0, step 1"):
+        evaluate(Bad(), make_q_network_that_pays(), 3, seed=0)
+
+
+def make_q_network_that_pays():
+    network = make_q_network(1, 2, seed=0)
+    network.set_weights([*[np.zeros_like(w) for w in network.get_weights()[:-1]], np.array([0.0, 1.0])])
+    return network

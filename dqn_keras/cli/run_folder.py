@@ -18,6 +18,8 @@ import numpy as np
 from dqn_keras import environments
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.checks.environments import can_flatten, check_environment, way_to_a_box
+from dqn_keras.checks.formulas import Formulas
+from dqn_keras.checks.numbers import check_flag
 from dqn_keras.config import Config
 from dqn_keras.interruption import TrainingInterrupted
 from dqn_keras.learn import double_td_targets, td_targets
@@ -94,7 +96,7 @@ class Settings:
 
 def own_formulas(double: bool, loss: str) -> dict[str, Any]:
     """Returns the targets and the loss as arguments of `train`."""
-    return {"targets": double_td_targets if double else td_targets, "loss": loss}
+    return {"targets": double_td_targets if check_flag("double", double) else td_targets, "loss": loss}
 
 
 def write_settings(folder: Path, settings: Settings) -> None:
@@ -159,6 +161,7 @@ def begin(folder: Path, settings: Settings, verbose: int) -> Run:
     """Starts a run in a folder that holds none yet."""
     env = settings.env.make_for_training()
     check_environment(env)  # before the folder is made
+    Formulas(**own_formulas(settings.double, settings.loss)).check()
     with _alone_in(folder):
         if (folder / "config.json").exists():
             raise ValueError(
