@@ -112,7 +112,8 @@ def parts_of_a_turn() -> dict[str, Callable[[tf.Tensor], tf.Tensor]]:
     indices = tf.constant(rng.integers(CONFIG.memory_size, size=CONFIG.batch_size), tf.int32)
     key = tf.constant(1, tf.int64)
     numbers = _numbers(env, agent, CONFIG, [0.1] * 100, 1)
-    loop = _Loop(env, check_functional(env), CONFIG, DEFAULT_FORMULAS, learner, rows, num_appended, numbers)
+    variables = rows, num_appended, tf.Variable(0, dtype=tf.int64)
+    loop = _Loop(env, check_functional(env), CONFIG, DEFAULT_FORMULAS, learner, variables, numbers)
 
     def batch(i: tf.Tensor) -> Experience:
         return unpack(tf.gather(rows, (indices + i) % CONFIG.memory_size), (4,))

@@ -153,7 +153,7 @@ def told_of(states, space, is_default_network=False):
     last = SimpleNamespace(number=0)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        assert list(watch.over([last], SimpleNamespace(memory=memory), num_episodes=1)) == [last]
+        assert list(watch.over([last], SimpleNamespace(memory=memory, is_done=bool), True)) == [last]
     return [str(x.message) for x in caught]
 
 
