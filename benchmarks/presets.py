@@ -63,10 +63,8 @@ def main() -> None:
     print(f"`python -m benchmarks.presets --seeds {arguments.seeds}`: seeds 0, 1, 2, ... (Python")
     print(f"{platform.python_version()}, {versions}, numpy {np.__version__}).")
     print("Solved: a mean reward of 100 episodes above Gymnasium's threshold, while training. Steps: median of the")
-    print(
-        "environment steps to solved. Time: median of one seed's training on one core, most of them with nothing left to"
-    )
-    print("compile. Greedy return: 100 episodes after the run, mean over the seeds. In brackets: 95 % intervals.\n")
+    print("environment steps to solved. Time: median of one seed's training on one core, with nothing left to compile")
+    print("for most. Greedy return: 100 episodes after the run, mean over the seeds. In brackets: 95 % intervals.\n")
     print("| environment | threshold | solved | steps | time | greedy return |")
     print("|---|---|---|---|---|---|")
     for env_id, study in found.items():
