@@ -17,7 +17,7 @@ import keras
 import numpy as np
 import tensorflow as tf
 
-from dqn_keras import Config, Sweep, double_td_targets, plot_sweep, sweep, sweep_table
+from dqn_keras import Config, Study, Sweep, double_td_targets, plot_sweep, sweep, sweep_table
 from dqn_keras.environments import CartPole
 
 ORIGINAL = Config()
@@ -84,11 +84,13 @@ FEWER_SEEDS = {TWO_LAYERS: 50, ORIGINAL_AT_475: 50}
 
 def run(num_seeds: int, file: Path | None) -> Sweep:
     """Makes the sweep, or continues the one in `file`."""
-    how = {"evaluate_on": CartPole(), "file": file}
-    many = {name: setting for name, setting in SETTINGS.items() if name not in FEWER_SEEDS}
-    found = dict(sweep(CartPole(), many, range(num_seeds), **how))
-    for name, most in FEWER_SEEDS.items():
-        found |= sweep(CartPole(), {name: SETTINGS[name]}, range(min(num_seeds, most)), **how)
+    found: dict[str, Study] = {}
+    for names, most in [(SETTINGS.keys() - FEWER_SEEDS, num_seeds), *(([name], n) for name, n in FEWER_SEEDS.items())]:
+        settings = {name: SETTINGS[name] for name in SETTINGS if name in names}
+        seeds = range(min(num_seeds, most))
+        found |= sweep(CartPole(), settings, seeds, evaluate_on=CartPole(), file=file)
+        if any(len(found[name].outcomes) < len(seeds) for name in settings):
+            raise SystemExit("interrupted")
     return Sweep({name: found[name] for name in SETTINGS})
 
 
