@@ -3,6 +3,21 @@
 from dqn_keras.config import Config
 
 presets: dict[str, Config] = {
-    "CartPole-v1": Config(tau=0.05, gamma=0.99, epsilon_min=0.01, solved_reward=475),
+    "CartPole-v1": Config(
+        tau=0.05,
+        gamma=0.99,
+        epsilon_min=0.01,
+        solved_reward=475,
+        solved_window=100,
+    ),
+    "Acrobot-v1": Config(
+        gamma=0.99,
+        decay=0.97,
+        epsilon_min=0.01,
+        hidden_units=(128,),
+        solved_reward=-100,
+        solved_window=100,
+    ),
 }
-"""For the id of an environment, parameters that solve it: `train(gymnasium.make(id), presets[id])`."""
+"""For the id of an environment, parameters that solve it: `train(gymnasium.make(id), presets[id])`. Solved means, as by
+Gymnasium, that the mean reward of 100 episodes is above the environment's `reward_threshold`."""

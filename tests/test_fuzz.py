@@ -18,7 +18,7 @@ def _quiet():
 
 
 def test_every_argument_of_every_public_function_is_tried():
-    names = set(dqn_keras.__all__) - RECORDS - {"environments", "__version__"}
+    names = set(dqn_keras.__all__) - RECORDS - {"environments", "presets", "__version__"}
     functions = {name: getattr(dqn_keras, name) for name in names}
     functions |= {f"ReplayMemory.{x}": getattr(dqn_keras.ReplayMemory, x) for x in ("append", "sample", "sample_rows")}
     functions |= {"Run.act": Run.act, "Run.save": Run.save}

@@ -156,6 +156,15 @@ def check_spaces(name: str, observations: gym.Space, actions: gym.Space) -> Spac
     return Spaces(observations.shape, dtype, int(actions.n), int(actions.start))
 
 
+def check_same_sizes(wish: str, wanted: Spaces, got: Spaces) -> None:
+    """Raises ValueError, with `wish` at its beginning, unless two environments have the same states and actions."""
+    shown_sizes = [
+        f"with {x.state_dtype} states of shape {x.state_shape} and {x.num_actions} actions" for x in (wanted, got)
+    ]
+    if shown_sizes[0] != shown_sizes[1]:
+        raise ValueError(f"{wish}, {shown_sizes[0]}, got {shown_sizes[1]}")
+
+
 def way_to_a_box(space: gym.Space) -> str:
     """Returns the end of a message about an observation space: which wrappers make a Box of it."""
     parts: dict[Any, gym.Space] = {}

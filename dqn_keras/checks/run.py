@@ -14,7 +14,7 @@ from gymnasium.experimental.functional import FuncEnv
 from dqn_keras._engine.private import arguments_of_compile
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import owners_optimizer
-from dqn_keras.checks.environments import Spaces, env_name, no_env, spaces_of
+from dqn_keras.checks.environments import check_same_sizes, env_name, no_env, spaces_of
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.checks.networks import check_optimizer, warn_of_inference_mode
 from dqn_keras.checks.numbers import check_count, check_flag, check_instance, check_path, check_sequence, shown
@@ -63,16 +63,7 @@ def _check_evaluation(evaluation: Evaluation, env: gym.Env | FuncEnv) -> None:
             f"callbacks must evaluate in an environment of their own, got an Evaluation in env {env_name(env)} itself: "
             "make a second one"
         )
-    wanted, got = (spaces._replace(first_action=0) for spaces in (spaces_of(env), evaluation.spaces))
-    if got != wanted:
-        raise ValueError(
-            f"callbacks must evaluate in an environment like env, {sizes_shown(wanted)}, got {sizes_shown(got)}"
-        )
-
-
-def sizes_shown(spaces: Spaces) -> str:
-    """Returns the sizes of an environment's spaces for a message."""
-    return f"with {spaces.state_dtype} states of shape {spaces.state_shape} and {spaces.num_actions} actions"
+    check_same_sizes("callbacks must evaluate in an environment like env", spaces_of(env), evaluation.spaces)
 
 
 def check_checkpoint(checkpoint: str | os.PathLike | None, checkpoint_every: int, resume: bool) -> int:

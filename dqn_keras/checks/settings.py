@@ -8,9 +8,9 @@ from gymnasium.experimental.functional import FuncEnv
 
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import owners_optimizer
-from dqn_keras.checks.environments import check_functional, env_name, spaces_of
+from dqn_keras.checks.environments import check_functional, check_same_sizes, env_name, spaces_of
 from dqn_keras.checks.numbers import check_instance, shown
-from dqn_keras.checks.run import check_arguments, sizes_shown
+from dqn_keras.checks.run import check_arguments
 from dqn_keras.config import Config
 from dqn_keras.storage.identity import identity, identity_with
 from dqn_keras.storage.parts import Part, describe
@@ -89,7 +89,4 @@ def _check_evaluate_on(setting: Setting) -> None:
     if not isinstance(place, gym.Env | FuncEnv):
         raise TypeError(f"evaluate_on must be a gymnasium.Env or a FuncEnv, got {shown(place)}")
     spaces = check_functional(place) if isinstance(place, FuncEnv) else spaces_of(place)
-    wanted, got = (x._replace(first_action=0) for x in (spaces_of(env), spaces))
-    if got != wanted:
-        shape = sizes_shown(wanted), sizes_shown(got)
-        raise ValueError(f"evaluate_on must be an environment like env {env_name(env)}, {shape[0]}, got {shape[1]}")
+    check_same_sizes(f"evaluate_on must be an environment like env {env_name(env)}", spaces_of(env), spaces)
