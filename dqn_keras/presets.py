@@ -18,6 +18,17 @@ presets: dict[str, Config] = {
         solved_reward=-100,
         solved_window=100,
     ),
+    "LunarLander-v3": Config(
+        alpha=0.001,
+        gamma=0.99,
+        tau=0.005,
+        memory_size=100_000,
+        decay=0.99,
+        epsilon_min=0.01,
+        hidden_units=(128, 128),
+        solved_reward=200,
+        solved_window=100,
+    ),
 }
 """For the id of an environment, parameters that solve it: `train(gymnasium.make(id), presets[id])`. Solved means, as by
 Gymnasium, that the mean reward of 100 episodes is above the environment's `reward_threshold`."""

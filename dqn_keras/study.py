@@ -205,7 +205,8 @@ def sweep(
     Raises:
         TypeError, ValueError, OSError: as for `study`; the message names the setting.
     """
-    return Sweep(_trained(check_settings(env, settings, evaluate_on), seeds, file, engine, num_workers, verbose))
+    checked = check_settings(env, settings, evaluate_on, verbose)
+    return Sweep(_trained(checked, seeds, file, engine, num_workers, verbose))
 
 
 def _trained(

@@ -144,14 +144,15 @@ ONE_NETWORK, ONE_OPTIMIZER = network(0), sgd()
         (
             {"q_network": ONE_NETWORK},
             TypeError,
-            "q_network must be a function of the seed that returns a new keras.Model",
+            r"q_network must be a function of \(seed\) that returns a new keras.Model",
         ),
         ({"q_network": lambda seed: ONE_NETWORK}, ValueError, "q_network must be .*returns the same object again"),
-        ({"q_network": lambda seed: "network"}, TypeError, "q_network must be a function of the seed that returns"),
+        ({"q_network": lambda seed: "network"}, TypeError, r"q_network must be a function of \(seed\) that returns"),
+        ({"q_network": lambda: network(0)}, TypeError, r"q_network must be a function of \(seed\), got"),
         ({"q_network": lambda seed: make_q_network(3, 2, (8,))}, ValueError, "q_network must "),
-        ({"optimizer": ONE_OPTIMIZER}, TypeError, "optimizer must be a function of no arguments that returns"),
+        ({"optimizer": ONE_OPTIMIZER}, TypeError, r"optimizer must be a function of \(\) that returns"),
         ({"optimizer": lambda: ONE_OPTIMIZER}, ValueError, "optimizer must be .*returns the same object again"),
-        ({"optimizer": "adam"}, TypeError, "optimizer must be a function of no arguments"),
+        ({"optimizer": "adam"}, TypeError, r"optimizer must be a function of \(\)"),
         ({"loss": "hubr"}, ValueError, "loss must be a name that Keras knows"),
         ({"targets": 3}, TypeError, "targets must be a function"),
         ({"evaluate_on": "CartPole-v1"}, TypeError, "evaluate_on must be a gymnasium.Env"),
@@ -163,6 +164,15 @@ def test_wrong_parts_are_refused_by_name_before_any_work(own, error, message):
         study(CartPole(), QUICK, [0], **own, verbose=0)
     with pytest.raises(error, match=rf"^settings\['x'\]: {message}"):
         sweep(CartPole(), {"plain": QUICK, "x": own}, [0], verbose=0)
+
+
+def test_what_settings_share_is_refused_by_its_own_name():
+    with pytest.raises(TypeError, match=r"^env must be"):
+        sweep("CartPole-v1", {"plain": QUICK}, [0], verbose=0)
+    with pytest.raises(ValueError, match=r"^evaluate_on must be an environment like env CartPole"):
+        sweep(CartPole(), {"plain": QUICK}, [0], evaluate_on=MountainCar(), verbose=0)
+    with pytest.raises(ValueError, match=r"^verbose must be"):
+        sweep(CartPole(), {"plain": QUICK}, [0], verbose=3)
 
 
 @pytest.mark.parametrize(

@@ -16,18 +16,18 @@ class Formulas(NamedTuple):
 
     def check(self) -> None:
         """Raises TypeError or ValueError if `learn` cannot take one of them."""
-        if not callable(self.targets) or isinstance(self.targets, type):
+        if not callable(self.targets) or isinstance(self.targets, type | keras.Model):
             raise TypeError(f"targets must be a function like td_targets, got {shown(self.targets)}")
         if isinstance(self.loss, str):
             self.loss_function()
-        elif not callable(self.loss) or isinstance(self.loss, type | keras.metrics.Metric):
+        elif not callable(self.loss) or isinstance(self.loss, type | keras.metrics.Metric | keras.Model):
             raise TypeError(
                 "loss must be a name that Keras knows, a keras.losses.Loss or a function of (y, q), "
                 f"got {shown(self.loss)}"
             )
-        _check_takes("targets", self.targets, ("experiences", "gamma", "q_network", "q_hat_network"))
+        check_takes("targets", self.targets, ("experiences", "gamma", "q_network", "q_hat_network"))
         if not isinstance(self.loss, str):
-            _check_takes("loss", self.loss, ("y", "q"))
+            check_takes("loss", self.loss, ("y", "q"))
 
     def loss_function(self) -> Callable:
         """Returns the loss as a function; raises ValueError if Keras does not know its name."""
@@ -40,7 +40,7 @@ class Formulas(NamedTuple):
 
     def y(self, experiences: Any, gamma: Any, q_network: keras.Model, q_hat_network: keras.Model) -> tf.Tensor:
         """Returns the targets [B], through which no gradient flows."""
-        y = _called("targets", self.targets, experiences, gamma, q_network, q_hat_network)
+        y = called("targets", self.targets, experiences, gamma, q_network, q_hat_network)
         batch_shape = experiences.reward.shape
         is_vector = tf.is_tensor(y) and y.shape.rank == 1 and y.shape.is_compatible_with(batch_shape)
         if not (is_vector and y.dtype == tf.float32):
@@ -54,14 +54,14 @@ class Formulas(NamedTuple):
         is_the_originals = loss is keras.losses.mean_squared_error  # called with two vectors, as in the original
         if isinstance(loss, keras.losses.Loss) or (isinstance(self.loss, str) and not is_the_originals):
             y, q = y[:, None], q[:, None]  # [B, 1], as in `fit`: Keras reduces over the last axis
-        value = _called("loss", loss, y, q)
+        value = called("loss", loss, y, q)
         if not tf.is_tensor(value) or not (value.shape.rank == 0 or value.shape.is_compatible_with(y.shape[:1])):
             got = f"shape {value.shape}" if tf.is_tensor(value) else shown(value)
             raise ValueError(f"loss must return a scalar tensor, or one value for each transition, got {got}")
         return tf.cast(tf.reduce_mean(value), tf.float32)
 
 
-def _called(name: str, function: Callable, *arguments: Any) -> Any:
+def called(name: str, function: Callable, *arguments: Any) -> Any:
     """Calls the user's function; adds a note to an error of its own, which says that it is not the package's."""
     try:
         return function(*arguments)
@@ -70,7 +70,7 @@ def _called(name: str, function: Callable, *arguments: Any) -> Any:
         raise
 
 
-def _check_takes(name: str, function: Callable, arguments: tuple[str, ...]) -> None:
+def check_takes(name: str, function: Callable, arguments: tuple[str, ...]) -> None:
     """Raises TypeError if the function cannot be called with this number of arguments."""
     try:
         inspect.signature(function, follow_wrapped=False).bind(*arguments)

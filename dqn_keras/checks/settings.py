@@ -9,6 +9,7 @@ from gymnasium.experimental.functional import FuncEnv
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import owners_optimizer
 from dqn_keras.checks.environments import check_functional, check_same_sizes, env_name, spaces_of
+from dqn_keras.checks.formulas import called, check_takes
 from dqn_keras.checks.numbers import check_instance, shown
 from dqn_keras.checks.run import check_arguments
 from dqn_keras.config import Config
@@ -19,9 +20,19 @@ from dqn_keras.workers import Setting
 
 
 def check_settings(
-    env: gym.Env | FuncEnv, settings: Mapping[str, Config | Mapping[str, Any]], evaluate_on: gym.Env | FuncEnv | None
+    env: gym.Env | FuncEnv,
+    settings: Mapping[str, Config | Mapping[str, Any]],
+    evaluate_on: gym.Env | FuncEnv | None,
+    verbose: int,
 ) -> dict[str, Setting]:
-    """Returns the settings of a sweep; raises TypeError or ValueError if one is not a Config or a dict of arguments."""
+    """Returns the settings of a sweep.
+
+    Raises:
+        TypeError, ValueError: a setting is not a Config or a dict of arguments, or what they share is wrong.
+    """
+    check_arguments(env, Config(), verbose)
+    if evaluate_on is not None:
+        _check_evaluate_on(env, evaluate_on)
     check_instance("settings", settings, Mapping, "a dict with a Config, or a dict of arguments, for each name")
     if not settings:
         raise ValueError("settings must hold at least one setting, got none")
@@ -57,10 +68,10 @@ def check_setting(name: str, setting: Setting, verbose: int, has_file: bool) -> 
 
 def _checked(setting: Setting, verbose: int, has_file: bool) -> dict[str, Any]:
     check_arguments(setting.env, setting.config, verbose)
-    _check_makes_new("q_network", "the seed", setting.q_network, (0,), keras.Model)
-    _check_makes_new("optimizer", "no arguments", setting.optimizer, (), keras.Optimizer)
+    _check_makes_new("q_network", ("seed",), setting.q_network, (0,), keras.Model)
+    _check_makes_new("optimizer", (), setting.optimizer, (), keras.Optimizer)
     if setting.evaluate_on is not None:
-        _check_evaluate_on(setting)
+        _check_evaluate_on(setting.env, setting.evaluate_on)
     parts = setting.own_parts(0)
     _, formulas, agent = prepare(setting.env, setting.config, 0, **parts)
     if not has_file:
@@ -71,21 +82,22 @@ def _checked(setting: Setting, verbose: int, has_file: bool) -> dict[str, Any]:
     return identity_with(facts, evaluate_on=Part("nothing") if place is None else describe(place)[0])
 
 
-def _check_makes_new(name: str, takes: str, function: Any, arguments: tuple, kind: type) -> None:
+def _check_makes_new(name: str, takes: tuple[str, ...], function: Any, arguments: tuple, kind: type) -> None:
     """Raises TypeError or ValueError unless the function returns a new object of this kind at each call."""
     if function is None:
         return
-    wanted = f"{name} must be a function of {takes} that returns a new keras.{kind.__name__}"
+    wanted = f"{name} must be a function of ({', '.join(takes)}) that returns a new keras.{kind.__name__}"
     if isinstance(function, kind) or not callable(function):
         raise TypeError(f"{wanted} for each run of a study, got {shown(function)}")
-    first, second = function(*arguments), function(*arguments)
-    check_instance(name, first, kind, f"a function of {takes} that returns a new keras.{kind.__name__}")
+    check_takes(name, function, takes)
+    first, second = called(name, function, *arguments), called(name, function, *arguments)
+    if not isinstance(first, kind):
+        raise TypeError(f"{wanted}, got one that returns {shown(first)}")
     if first is second:
         raise ValueError(f"{wanted}, got one that returns the same object again")
 
 
-def _check_evaluate_on(setting: Setting) -> None:
-    env, place = setting.env, setting.evaluate_on
+def _check_evaluate_on(env: gym.Env | FuncEnv, place: Any) -> None:
     if not isinstance(place, gym.Env | FuncEnv):
         raise TypeError(f"evaluate_on must be a gymnasium.Env or a FuncEnv, got {shown(place)}")
     spaces = check_functional(place) if isinstance(place, FuncEnv) else spaces_of(place)

@@ -473,6 +473,7 @@ def acting_doors() -> Iterator[tuple[str, Door]]:
             dqn_keras.evaluate,
             lambda: {"env": Corridor(3, 3), "q_network": shared()["q"], **arguments},
             {**claims, **right, "num_episodes": count()},
+            {"env": "q_network"},  # which may not fit it
         ),
     )
     yield (
@@ -481,6 +482,7 @@ def acting_doors() -> Iterator[tuple[str, Door]]:
             evaluation_at_the_start,
             lambda: {"env": Corridor(3, 3), "every_steps": 5, "best": "x.keras", **arguments},
             {**claims, "every_steps": count(), "best": no_value, "num_episodes": count()},
+            {"env": "q_network"},  # which may not fit it
         ),
     )
     states = named("zeros(2)", "a tensor [2]", "[1, 2]", "an array of booleans")
@@ -580,13 +582,16 @@ def many_seeds_doors() -> Iterator[tuple[str, Door]]:
         "evaluate_on": one_of(no_value, is_a(Corridor)),
     }
     own = {"q_network": None, "optimizer": None, "loss": None}
-    parts = {"q_network": no_value, "optimizer": no_value, "targets": nothing, "loss": named("None", "a loss")}
+    parts = {"q_network": no_value, "targets": nothing, "loss": named("None", "a loss")}
+    parts["optimizer"] = named("None", "an optimizer's class")
+    also = {"evaluate_on": "env"}
     yield (
         "study",
         Door(
             dqn_keras.study,
             lambda: {"env": Corridor(3, 3), "config": QUICK, **how, **own},
             {**claims, **parts, "config": is_a(Config)},
+            also,
         ),
     )
     yield (
@@ -595,6 +600,7 @@ def many_seeds_doors() -> Iterator[tuple[str, Door]]:
             dqn_keras.sweep,
             lambda: {"env": Corridor(3, 3), "settings": {"a": QUICK}, **how},
             {**claims, "settings": nothing},
+            also,
         ),
     )
 
