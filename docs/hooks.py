@@ -17,6 +17,7 @@ ALT_TEXTS = {  # of the pictures in the notebooks, by the tag of their cell
     "save-rewards": "Episode rewards of one run: about 20 for 170 episodes, then a climb to over 225",
     "save-pole": "The moving picture of one greedy episode: the network keeps the pole upright",
     "save-hundred_seeds": "A hundred seeds: learning curves, episodes to solved, share solved by episode",
+    "save-slow_target": "Share not solved by episode 500, median episodes and greedy return for four values of tau",
     "save-catch_run": "A run at a glance: rewards, Q-values under their bound, TD error, terminal share",
     "save-catch": "The moving picture of an episode: the paddle catches ball after ball",
     "save-one_collapse": "One seed that got stuck: reward, greedy return, highest Q, share of terminal transitions",

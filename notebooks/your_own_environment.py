@@ -119,7 +119,7 @@ run = train(env, config, seed=0)
 # Above the rewards, below what to look at if they do not rise. The Q-values stay under their bound: no return can be
 # higher than the highest reward at every step, discounted, $r_{max} / (1 - \gamma) = 20$; one ball in 25 steps is
 # worth far less. The error of their predictions rises with what there is to predict. The memory holds fewer and fewer
-# ends of episodes: a network that has not seen a failure for long may forget why it avoids them.
+# ends of episodes, since fewer balls are missed.
 
 # %% tags=["save-catch_run"]
 axes = plot_run(run, speed=False)
