@@ -1,6 +1,7 @@
 from . import environments as environments
 from .agent import Agent as Agent
 from .config import Config as Config
+from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
 from .interruption import TrainingInterrupted as TrainingInterrupted
 from .learn import double_td_targets as double_td_targets

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -31,11 +32,16 @@ class Agent:
     rng: np.random.Generator
     """Source of the random draws for acting and sampling in a gymnasium.Env."""
     epsilon: float
-    """Probability of a random action in the next episode."""
+    """Probability of a random action in the next episode; `policy.epsilon_at` gives that of a step."""
     episodes: list["Episode"] = dataclasses.field(default_factory=list)
     """Records of the episodes so far; the length of the list is the number of the next episode."""
     num_updates: int = 0
     """Number of gradient steps taken."""
+
+    def is_done(self, config: Config) -> bool:
+        """Returns whether the run has played all its episodes or all its steps."""
+        num_steps = self.memory.num_appended
+        return len(self.episodes) >= config.num_episodes or num_steps >= (config.num_steps or math.inf)
 
     @property
     def learner(self) -> Learner:

@@ -6,33 +6,38 @@ from typing import TYPE_CHECKING
 
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import DivergedError
+from dqn_keras.evaluation import Evaluation
 from dqn_keras.metrics import LOGGED, Episode, Log
 
 if TYPE_CHECKING:
     from dqn_keras.training import Run
 
 
+_NAMES = sorted(LOGGED)
+
+
 class Listeners:
     """The callbacks of a run. As in `fit`, nothing more is called after an exception."""
 
     def __init__(self, run: "Run", callbacks: Sequence[keras.callbacks.Callback]) -> None:
-        self._run, self._network, self._num_episodes = run, run.q_network, run.config.num_episodes
-        self.callbacks = list(callbacks)
+        self._run, self._network = run, run.q_network
+        # Evaluations come first, so that all others find their mean return in the logs.
+        self.callbacks = sorted(callbacks, key=lambda callback: not isinstance(callback, Evaluation))
         self._list = keras.callbacks.CallbackList(
-            self.callbacks, model=self._network, epochs=self._num_episodes, steps=1, verbose=0
+            self.callbacks, model=self._network, epochs=run.config.num_episodes, steps=1, verbose=0
         )
         self._log = Log(run.config)
         self._last_logs: dict[str, float] | None = None
         for episode, speed in zip(run.episodes, run.steps_per_second, strict=True):
             self._log.add(episode, speed)
+        for callback in self.callbacks:
+            if isinstance(callback, Evaluation):
+                callback.num_steps = sum(episode.steps for episode in run.episodes)
 
     def begin(self) -> None:
         """Calls `on_train_begin`."""
         self._network.stop_training = False
         self._list.on_train_begin()
-        for callback in self.callbacks:
-            if isinstance(callback, keras.callbacks.CSVLogger):
-                callback.keys = sorted(LOGGED)  # or it adds an empty column val_NAME for each, at the same cost
 
     def end(self) -> None:
         """Calls `on_train_end`."""
@@ -43,7 +48,8 @@ class Listeners:
 
         If learning diverges, TerminateOnNaN asks to stop, and then there is no error.
         """
-        for number in range(len(self._run.episodes), self._num_episodes):
+        agent, number = self._run.agent, len(self._run.episodes)
+        while number < len(agent.episodes) or not agent.is_done(self._run.config):
             self._tell("on_epoch_begin", number, {})
             self._tell("on_train_batch_begin", 0, {})
             try:
@@ -61,6 +67,7 @@ class Listeners:
             yield episode
             if self._network.stop_training:
                 return
+            number += 1
 
     def _tell(self, event: str, number: int, logs: dict[str, float]) -> None:
         for callback in self.callbacks:  # a CallbackList's own methods take 50 us: they look for tensors
@@ -69,9 +76,14 @@ class Listeners:
     def _end_epoch(self, number: int, logs: dict[str, float]) -> None:
         self._last_logs = logs
         for callback in self.callbacks:
-            if type(callback) is keras.callbacks.CSVLogger and callback.writer:
+            if isinstance(callback, keras.callbacks.CSVLogger) and not callback.writer:
+                callback.keys = sorted(logs)  # or it adds an empty column val_NAME for each, at the same cost
+            if type(callback) is keras.callbacks.CSVLogger and callback.writer and callback.keys == _NAMES:
                 # The same row as its on_epoch_end writes, without a search for arrays in the logs.
                 callback.writer.writer.writerow([number, *map(logs.get, callback.keys)])
                 callback.csv_file.flush()
             else:
                 callback.on_epoch_end(number, logs)
+        for name in logs.keys() - LOGGED.keys():  # as Keras' History has them
+            values = self._run.added_logs.setdefault(name, [])
+            values += [math.nan] * (number - len(values)) + [logs[name]]

@@ -1,14 +1,20 @@
-"""Greedy episodes: how good a network is without exploration."""
+"""Greedy episodes: how good a network is without exploration, after a run and during it."""
+
+import math
+import os
+import warnings
 
 import gymnasium as gym
 import numpy as np
 
 from dqn_keras._engine.numpy_acting import q_function
 from dqn_keras._engine.tensorflow import keras
+from dqn_keras.agent import keeps_averages
 from dqn_keras.checks.environments import CheckedEnv
 from dqn_keras.checks.networks import check_fits
-from dqn_keras.checks.numbers import check_count
+from dqn_keras.checks.numbers import check_count, check_path, shown
 from dqn_keras.seeding import checked_seed, evaluation_seed
+from dqn_keras.storage.networks import load_q_network, save_q_network
 
 
 def evaluate(
@@ -40,3 +46,129 @@ def evaluate(
             if terminated or truncated:
                 break
     return returns
+
+
+class Evaluation(keras.callbacks.Callback):
+    """Evaluates the network during a run and keeps the best one: a Keras callback for `train`.
+
+    `train` explores, and learns between the steps of an episode, so that its rewards belong to no network that could be
+    kept. This callback plays greedily in an environment of its own: at the start of the run, at the end of the first
+    episode at or after each multiple of `every_steps` environment steps, and at the end of the run. The seeds are the
+    same each time, so that two evaluations differ only by their networks. Training gives the same result, bit for bit,
+    as without the callback. In compiled episodes, it makes each episode a call of its own, as most callbacks do.
+
+    The mean return is logged as `greedy_return`: in `run.history`, and for all other callbacks, wherever they stand in
+    the list. Each episode logs that of the latest evaluation, because Keras' callbacks would keep a NaN as their best
+    value. So `EarlyStopping("greedy_return", mode="max", patience=...)` counts its patience in episodes. The evaluation
+    at the end comes after the last episode's log.
+
+    A resumed run evaluates the network in `best` first, and replaces it only by a better one. A new run replaces it.
+
+    Args:
+        env: a gymnasium.Env, with the states and actions of the environment that is trained in, but not that object:
+            wrappers and environments may keep something from one episode to the next.
+        every_steps: environment steps of the run from one evaluation to the next.
+        num_episodes: number of episodes of an evaluation.
+        best: a .keras file for the network with the highest mean return, which `load_q_network` loads; of equal ones,
+            the earliest stays. The file is written whole or not at all. If it cannot be written during the run, a
+            warning says so and the run continues. None keeps no network.
+        seed: a whole number, as for `evaluate`; None draws one.
+        max_steps: maximum number of environment steps per episode.
+
+    Attributes:
+        steps: environment steps of the run at each evaluation, from where the run began or was resumed.
+        returns: mean return of each evaluation, undiscounted.
+        best_return: mean return of the network in `best`; without a file, the highest so far.
+
+    Raises:
+        TypeError, ValueError: an argument is not supported. From `train`: the environment does not fit, the network
+            cannot be saved, or `best` holds another network than one of the run that is resumed.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        every_steps: int,
+        num_episodes: int = 10,
+        best: str | os.PathLike | None = None,
+        *,
+        seed: int | None = 0,
+        max_steps: int = 1_000,
+    ) -> None:
+        super().__init__()
+        self.spaces = CheckedEnv(env).spaces
+        self.env = env
+        self.every_steps = check_count("every_steps", every_steps)
+        self.num_episodes = check_count("num_episodes", num_episodes)
+        self.best = None if best is None else check_path("best", best)
+        if self.best is not None and self.best.suffix != ".keras":
+            raise ValueError(f"best must end in .keras, got {shown(str(best))}")
+        self.seed, self.max_steps = checked_seed(seed), check_count("max_steps", max_steps)
+        self.num_steps = 0  # environment steps of the run; `train` sets those that a resumed run has behind it
+        self.steps: list[int] = []
+        self.returns: list[float] = []
+        self.best_return = -math.inf
+
+    def on_train_begin(self, logs: dict | None = None) -> None:
+        """Evaluates the network that the run starts with."""
+        self.steps, self.returns, self.best_return = [], [], -math.inf
+        if self.num_steps and self.best is not None and self.best.exists():
+            try:
+                self.best_return = self._mean_return(load_q_network(self.best))
+            except ValueError as error:
+                raise ValueError(
+                    f"best {self.best} must hold a network of the run that is resumed, or not exist: {error}"
+                ) from error
+        self._evaluate()
+
+    def on_epoch_end(self, epoch: int, logs: dict) -> None:
+        """Evaluates the network if it is due, and logs the latest mean return."""
+        if _has_diverged(logs):
+            logs["greedy_return"] = math.nan
+            return
+        num_due = self.num_steps // self.every_steps
+        self.num_steps += logs["steps"]
+        if self.num_steps // self.every_steps > num_due:
+            self._evaluate()
+        logs["greedy_return"] = self.returns[-1]
+
+    def on_train_end(self, logs: dict | None = None) -> None:
+        """Evaluates the final network, unless it was evaluated after the last episode."""
+        is_another = self.num_steps > self.steps[-1] or keeps_averages(self.model.optimizer)
+        if is_another and not _has_diverged(logs):
+            self._evaluate()
+
+    def _evaluate(self) -> None:
+        mean_return = self._mean_return(self.model)
+        self.steps.append(self.num_steps)
+        self.returns.append(mean_return)
+        if mean_return > self.best_return and self._keep():
+            self.best_return = mean_return
+
+    def _mean_return(self, q_network: keras.Model) -> float:
+        """Returns the mean return of a network, whose own state (such as the seed of a noisy layer) stays as it was."""
+        variables = q_network.non_trainable_variables
+        before = [variable.numpy() for variable in variables]
+        try:
+            return float(evaluate(self.env, q_network, self.num_episodes, self.seed, self.max_steps).mean())
+        finally:
+            for variable, value in zip(variables, before, strict=True):
+                variable.assign(value)
+
+    def _keep(self) -> bool:
+        """Saves the network; returns False, with a warning, if the file cannot be written during the run."""
+        if self.best is None:
+            return True
+        try:
+            save_q_network(self.best, self.model)
+        except OSError as error:
+            if len(self.returns) == 1:
+                raise OSError(f"best {self.best} cannot be written: {error}") from error
+            warnings.warn(f"best {self.best} could not be written ({error}); the last one stays", stacklevel=2)
+            return False
+        return True
+
+
+def _has_diverged(logs: dict | None) -> bool:
+    """Returns whether these are the logs of an episode in which learning diverged: all are NaN."""
+    return logs is not None and math.isnan(logs["steps"])

@@ -14,10 +14,10 @@ class Episode(NamedTuple):
     number: int
     """Number of the episode, from 0."""
     reward: float
-    """Undiscounted sum of its rewards."""
+    """Undiscounted sum of its rewards; NaN if `num_steps` cut the episode short."""
     steps: int
     epsilon: float
-    """Probability of a random action in it."""
+    """Probability of a random action in it; at its first step, if it falls from step to step."""
     loss: float
     """Mean loss over its updates. This and the next three are NaN if it had no updates."""
     mean_q: float
@@ -33,10 +33,10 @@ class Episode(NamedTuple):
 
 
 LOGGED = {
-    "reward": "Undiscounted sum of the episode's rewards.",
+    "reward": "Undiscounted sum of the episode's rewards; NaN if `num_steps` cut the episode short.",
     "average_reward": "Mean reward of the last `solved_window` episodes; of fewer at the start.",
     "steps": "Number of environment steps.",
-    "epsilon": "Probability of a random action.",
+    "epsilon": "Probability of a random action; at the episode's first step, if it falls from step to step.",
     "loss": "Mean loss over the episode's updates. It, mean_q, max_q and td_error are NaN before the first update.",
     "mean_q": "Mean over the episode's batches of max_a Q(s, a).",
     "max_q": "Highest Q-value in the episode's batches.",
@@ -63,7 +63,8 @@ class Log:
     def add(self, episode: Episode, steps_per_second: float) -> dict[str, float]:
         """Adds the next episode and returns its logged values."""
         config = self._config
-        self._rewards.append(episode.reward)
+        if not math.isnan(episode.reward):
+            self._rewards.append(episode.reward)
         self._max_reward = max(self._max_reward, episode.max_reward)
         self._memory.append((episode.steps, episode.terminated))
         self._steps += episode.steps
@@ -74,7 +75,7 @@ class Log:
             self._terminated -= terminated
         return {
             "reward": episode.reward,
-            "average_reward": sum(self._rewards) / len(self._rewards),
+            "average_reward": sum(self._rewards) / len(self._rewards) if self._rewards else math.nan,
             "steps": episode.steps,
             "epsilon": episode.epsilon,
             "loss": episode.loss,

@@ -68,7 +68,8 @@ def plot_history(history: Mapping[str, Sequence[float]], config: Config, speed: 
     figure = plt.figure(figsize=(10, 3.5 + 2.75 * num_rows), layout="constrained")
     grid = figure.add_gridspec(1 + num_rows, num_columns, height_ratios=(1.4, *[1] * num_rows))
     rewards = plot_rewards(columns["reward"], figure.add_subplot(grid[0, :]), window=config.solved_window)
-    rewards.axhline(config.solved_reward, color="black", linestyle=":", linewidth=1, label="Solved")
+    if config.solved_reward is not None:
+        rewards.axhline(config.solved_reward, color="black", linestyle=":", linewidth=1, label="Solved")
     rewards.legend(loc="upper left")
     cells = [grid[1 + i, j] for i in range(num_rows) for j in range(num_columns)]
     values, errors, terminals, *others = panels = [figure.add_subplot(cell, sharex=rewards) for cell in cells]

@@ -1,4 +1,4 @@
-"""The epsilon-greedy policy, and the decay of epsilon from episode to episode."""
+"""The epsilon-greedy policy, and how epsilon falls during a run."""
 
 from typing import Any
 
@@ -47,4 +47,22 @@ def decay_epsilon(epsilon: float, config: Config) -> float:
     """Returns epsilon for the next episode: `epsilon` times `decay`, but not below `epsilon_min`."""
     epsilon = check_number("epsilon", epsilon, at_least=0, at_most=1)
     check_instance("config", config, Config, "a Config")
-    return max(epsilon * config.decay, config.epsilon_min)
+    return epsilon_of_next_episode(epsilon, config)
+
+
+def epsilon_of_next_episode(epsilon: float, config: Config) -> float:
+    """Does what `decay_epsilon` does, without checks; with `epsilon_steps`, epsilon does not change here."""
+    return epsilon if config.epsilon_steps is not None else max(epsilon * config.decay, config.epsilon_min)
+
+
+def epsilon_at(step: int, epsilon: float, config: Config) -> float:
+    """Returns the probability of a random action at one environment step of the run, counted from 0.
+
+    It is 1 before `learning_starts`, then on the straight line of `epsilon_steps`; without that, it is `epsilon`, the
+    value of the whole episode.
+    """
+    if step < config.learning_starts:
+        return 1.0
+    if config.epsilon_steps is None:
+        return epsilon
+    return config.epsilon_min + (config.epsilon - config.epsilon_min) * max(0.0, 1 - step / config.epsilon_steps)

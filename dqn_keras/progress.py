@@ -1,5 +1,6 @@
 """The printed lines and the progress bar of a run, in a terminal or in a notebook."""
 
+import math
 import warnings
 from typing import TYPE_CHECKING
 
@@ -23,8 +24,11 @@ class Progress:
 
     def __init__(self, run: "Run", verbose: int) -> None:
         self._run, self._verbose = run, verbose
-        num_episodes = run.config.num_episodes
-        self._bar = tqdm(total=num_episodes, initial=len(run.episodes), unit="episode", disable=verbose < 2)
+        num_steps, num_episodes = run.config.num_steps, run.config.num_episodes
+        self._counts_steps = num_steps is not None
+        done = run.agent.memory.num_appended if num_steps else len(run.episodes)
+        unit = "step" if num_steps else "episode"
+        self._bar = tqdm(total=num_steps or num_episodes, initial=done, unit=unit, disable=verbose < 2)
 
     def __enter__(self) -> "Progress":
         return self
@@ -34,8 +38,8 @@ class Progress:
 
     def show(self, episode: Episode) -> None:
         """Moves the bar; every 100 episodes, also prints the last reward and the average of the last 100."""
-        self._bar.update()
-        if self._verbose and episode.number % 100 == 0:
+        self._bar.update(episode.steps if self._counts_steps else 1)
+        if self._verbose and episode.number % 100 == 0 and not math.isnan(episode.reward):
             last = [e.reward for e in self._run.episodes[max(0, episode.number - 99) : episode.number + 1]]
             say = self._bar.write if self._verbose == 2 else print
             average = round(float(np.mean(last)), 2)

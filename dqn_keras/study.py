@@ -29,7 +29,7 @@ from dqn_keras._engine.libraries import is_of_a_library
 from dqn_keras._engine.programs import shared_in
 from dqn_keras._engine.recycling import recycle
 from dqn_keras._engine.tensorflow import tf
-from dqn_keras.checks.numbers import check_count, check_path, shown
+from dqn_keras.checks.numbers import check_choice, check_count, check_path
 from dqn_keras.checks.run import check_arguments, check_seeds
 from dqn_keras.config import Config
 from dqn_keras.interruption import TrainingInterrupted, sigterm_interrupts
@@ -130,8 +130,7 @@ def study(
     """
     check_arguments(env, config, verbose)
     seeds = check_seeds(seeds)
-    if not isinstance(engine, str) or engine not in _ENGINES:
-        raise ValueError(f"engine must be one of {', '.join(_ENGINES)}, got {shown(engine)}")
+    check_choice("engine", engine, tuple(_ENGINES))
     num_workers = cpu_count() if num_workers is None else check_count("num_workers", num_workers)
     path = None if file is None else check_path("file", file).absolute()
     interrupted = False

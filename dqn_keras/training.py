@@ -11,13 +11,15 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 import gymnasium as gym
 import numpy as np
 from gymnasium.experimental.functional import FuncEnv
+from numpy.typing import ArrayLike
 
+from dqn_keras._engine.numpy_acting import q_values_now
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import Agent, keeps_averages, make_agent, optimizer_shown, owners_optimizer
 from dqn_keras.callbacks import Listeners
 from dqn_keras.checks.environments import CheckedEnv, Spaces, check_environment, env_name, some_states
 from dqn_keras.checks.formulas import Formulas
-from dqn_keras.checks.observations import Watch
+from dqn_keras.checks.observations import Watch, check_state
 from dqn_keras.checks.run import check_arguments, check_callbacks, check_checkpoint, check_own_parts
 from dqn_keras.config import Config
 from dqn_keras.interruption import TrainingInterrupted, stop_requests
@@ -48,6 +50,10 @@ class Run:
     """Whether learning diverged, and a callback (keras.callbacks.TerminateOnNaN) ended the run without an error."""
     steps_per_second: list[float] = dataclasses.field(default_factory=list)
     """Environment steps per second of each episode, learning included; NaN for episodes from before a resume."""
+    first_action: int = 0
+    """The environment's number for the action of index 0."""
+    added_logs: dict[str, list] = dataclasses.field(default_factory=dict)
+    """What callbacks added to the logs, such as `greedy_return`."""
 
     @property
     def solved_at(self) -> int | None:
@@ -61,13 +67,18 @@ class Run:
 
     @property
     def rewards(self) -> np.ndarray:
-        """Each episode's undiscounted sum of rewards, [num_episodes] float64."""
+        """Each episode's undiscounted sum of rewards, [num_episodes] float64; NaN if `num_steps` cut it short."""
         return np.array([episode.reward for episode in self.episodes], np.float64)
 
     @property
     def history(self) -> dict[str, list[float]]:
-        """The logs that callbacks get, one list for each name, like `history` in the result of Keras' `model.fit`."""
-        return history(self.episodes, self.config, self.steps_per_second)
+        """The logs of callbacks, one list for each name, like `history` in the result of Keras' `model.fit`.
+
+        What a callback adds to the logs is there, too, with NaN for episodes in which it added nothing.
+        """
+        num_episodes = len(self.episodes)
+        added = {name: [*values, *[math.nan] * num_episodes][:num_episodes] for name, values in self.added_logs.items()}
+        return history(self.episodes, self.config, self.steps_per_second) | added
 
     @property
     def seed(self) -> int:
@@ -83,6 +94,19 @@ class Run:
     def q_hat_network(self) -> keras.Sequential:
         """The slow copy, which gave the targets."""
         return self.agent.q_hat_network
+
+    def act(self, state: ArrayLike) -> int:
+        """Returns the greedy action in one state, as the environment numbers its actions: `env.step(run.act(state))`.
+
+        Args:
+            state: an observation of the environment, [*S].
+
+        Raises:
+            TypeError, ValueError: `state` is not an array of finite numbers of shape [*S].
+        """
+        memory = self.agent.memory
+        checked = check_state("state", state, memory.state_shape, memory.rows.dtype)
+        return self.first_action + int(q_values_now(self.q_network, checked).argmax())
 
     def save(self, path: str | os.PathLike) -> None:
         """Saves only the network that acts, as a .keras file; `load_q_network`, or Keras anywhere, loads it."""
@@ -108,7 +132,7 @@ def train(
     resume: bool = False,
     verbose: int = 1,
 ) -> Run:
-    """Trains a Deep Q-Network until it solves `env` or has played `config.num_episodes` episodes.
+    """Trains a Deep Q-Network until it solves `env` or has played all the episodes or steps that `config` allows.
 
     `train` uses your network, optimizer, targets, loss and environment themselves, not copies of them. It compiles them
     again at each call, so that it sees your changes.
@@ -157,7 +181,7 @@ def train(
             diverged.
     """
     check_arguments(env, config, verbose)
-    callbacks = check_callbacks(callbacks)
+    callbacks = check_callbacks(callbacks, env)
     checkpoint_every = check_checkpoint(checkpoint, checkpoint_every, resume)
     spaces = check_environment(env, q_network)
     formulas = check_own_parts(config, q_network, optimizer, targets, loss)
@@ -174,7 +198,7 @@ def train(
             resumed_from = checkpoints.begin(agent, seed, resume)
             if verbose and resume:
                 print(f"Resumed at episode {len(agent.episodes)} from {resumed_from}" if resumed_from else "A new run")
-        run = Run(config, agent, steps_per_second=[math.nan] * len(agent.episodes))
+        run = Run(config, agent, steps_per_second=[math.nan] * len(agent.episodes), first_action=spaces.first_action)
         episodes_per_call = min(100, checkpoint_every) if checkpoints else 100
         watch = Watch(env_name(env), env.observation_space, is_default_network=q_network is None)
         played = _timed(_episodes(env, spaces, run, formulas, callbacks, episodes_per_call, watch), run)
@@ -187,13 +211,26 @@ def train(
     progress.show_end()
     if is_asked_to_stop():
         raise TrainingInterrupted(run, checkpoints.folder if checkpoints else None)
+    _warn_of_an_early_end(run)
+    return run
+
+
+def _warn_of_an_early_end(run: Run) -> None:
+    """Warns if a limit ended the run before it could do what its other numbers ask for."""
+    agent, config = run.agent, run.config
+    num_steps = agent.memory.num_appended
     if not (agent.num_updates or run.diverged):
         warnings.warn(
             f"train ended without an update: the memory holds {len(agent.memory)} transitions, "
-            f"batch_size is {config.batch_size}",
-            stacklevel=2,
+            f"batch_size is {config.batch_size}, learning_starts is {config.learning_starts}",
+            stacklevel=3,
         )
-    return run
+    if len(run.episodes) == config.num_episodes and run.solved_at is None and num_steps < (config.num_steps or 0):
+        warnings.warn(
+            f"train ended after num_episodes={config.num_episodes} episodes and {num_steps} of "
+            f"num_steps={config.num_steps} environment steps",
+            stacklevel=3,
+        )
 
 
 def _episodes(
@@ -208,12 +245,12 @@ def _episodes(
     """Returns the episodes of the loop that can play `env`."""
     if not isinstance(env, FuncEnv):
         played = gymnasium.episodes(CheckedEnv(env, watch), run.agent, run.config, formulas)
-        return watch.over(played, run.agent, run.config.num_episodes)
+        return watch.over(played, run.agent, run.config)
     # Other callbacks may read and change the agent after each episode.
     only_logs = all(type(callback) is keras.callbacks.CSVLogger for callback in callbacks)
     at_once = episodes_per_call if only_logs else 1
     played = compiled.episodes(env, spaces, run.agent, run.config, at_once, formulas)
-    return watch.over(played, run.agent, run.config.num_episodes)
+    return watch.over(played, run.agent, run.config)
 
 
 def _play_until_over(
@@ -236,7 +273,7 @@ def _play_until_over(
             if run.solved_at is not None:
                 return
             if is_asked_to_stop():
-                run.interrupted = len(run.episodes) < run.config.num_episodes
+                run.interrupted = not run.agent.is_done(run.config)
                 return
 
 
@@ -279,5 +316,7 @@ def _is_solved(episodes: Sequence[Episode], config: Config) -> bool:
     Compiled episodes stop early where it may hold (`_Loop.play`), so that a change of the rule belongs there, too.
     The original also takes the mean of fewer episodes than the window, so that one lucky first episode could stop it.
     """
+    if config.solved_reward is None:
+        return False
     last = [episode.reward for episode in episodes[-config.solved_window :]]
     return len(last) == config.solved_window and float(np.mean(last)) > config.solved_reward

@@ -31,10 +31,26 @@ OTHERS = {
 }
 
 
-@pytest.fixture(scope="module", params=[{}, OTHERS], ids=["the original's parameters", "others"])
+PUBLISHED = {
+    "steps_per_update": 5,
+    "steps_count_from": "run",
+    "gradient_steps": 3,
+    "gradient_steps_per_target": 4,
+    "tau": 1.0,
+    "learning_starts": 300,
+    "epsilon_steps": 1_500,
+    "num_steps": 2_503,
+    "solved_reward": None,
+}
+
+
+@pytest.fixture(
+    scope="module", params=[{}, OTHERS, PUBLISHED], ids=["the original's parameters", "others", "a published rhythm"]
+)
 def run(request):
     """A hundred and some episodes, every transition of them kept."""
-    return train(CartPole(), Config(num_episodes=120, solved_reward=1e9, **request.param), seed=0, verbose=0)
+    config = Config(**{"num_episodes": 120, "solved_reward": 1e9, **request.param})
+    return train(CartPole(), config, seed=0, verbose=0)
 
 
 def transitions(run):
@@ -48,7 +64,8 @@ def transitions(run):
 @pytest.mark.slow
 def test_whole_episodes_replayed_in_gymnasium_agree(run, cartpole):
     played = transitions(run)
-    assert len(played) == 120
+    num_steps = run.config.num_steps
+    assert len(played) == 120 if num_steps is None else len(run.agent.memory) == num_steps
     initial = tf.function(CartPole().initial, jit_compile=True)  # XLA draws other float64 numbers than TensorFlow
     for number, episode in enumerate(played):
         cartpole.reset(seed=0)
@@ -59,9 +76,10 @@ def test_whole_episodes_replayed_in_gymnasium_agree(run, cartpole):
             observation, reward, terminated, truncated, _ = cartpole.step(int(a))
             np.testing.assert_allclose(episode.next_state[t], observation, rtol=0, atol=1e-5)
             assert (reward, terminated) == (episode.reward[t], episode.terminal_state[t])
-        assert terminated or truncated
+        is_cut = num_steps is not None and number == len(played) - 1
+        assert (terminated or truncated) != is_cut
         assert run.episodes[number].steps == len(episode.action)
-        assert run.episodes[number].reward == episode.reward.sum()
+        np.testing.assert_equal(run.episodes[number].reward, np.nan if is_cut else episode.reward.sum())
 
 
 @pytest.mark.slow
@@ -72,21 +90,34 @@ def test_its_draws_actions_and_updates_replayed_step_by_step_through_learn_agree
     close_calls = 0
     for number, episode in enumerate(transitions(run)):
         key = episode_key(tf.constant(draws_key(0)), tf.constant(number))
-        for t, a in enumerate(episode.action):
+        first = num_steps % n if config.steps_count_from == "run" else 0
+        for t, a in enumerate(episode.action, start=first):
             turn, j = (t + n - 1) // n, (t + n - 1) % n
-            if j == 0 or t == 0:
+            if j == 0 or t == first:
                 bits = draw_bits(2 * n + batch_size, key, turn)
+            if config.epsilon_steps:
+                epsilon = 1 - 0.9 * min(1, num_steps / config.epsilon_steps)
+            if num_steps < config.learning_starts:
+                epsilon = 1
+            if t == first:
+                assert run.episodes[number].epsilon == pytest.approx(epsilon)
             if to_uniform(bits)[j] < np.float32(epsilon):
                 assert a == to_integer(bits, 2)[n + j]
             else:
-                q_values = agent.q_network(episode.state[t][None]).numpy()[0]
+                q_values = agent.q_network(episode.state[t - first][None]).numpy()[0]
                 close_calls += a != q_values.argmax()
                 assert q_values[a] >= q_values.max() - 1e-3
             num_steps += 1
-            if t % n == 0 and num_steps >= batch_size:
-                indices = sample_indices(bits[2 * n :], key, turn, num_steps, config.memory_size).numpy()
-                learn(unpack(rows[indices], (4,)), config.gamma, *agent.learner, tau=config.tau)
-                updates += 1
+            if t % n == 0 and num_steps >= batch_size and num_steps > config.learning_starts:
+                for k in range(config.gradient_steps):
+                    counter, draws = turn, bits[2 * n :]
+                    if config.gradient_steps > 1:
+                        counter = turn + k * 2**44
+                        draws = draw_bits(batch_size, key, counter)
+                    indices = sample_indices(draws, key, counter, num_steps, config.memory_size).numpy()
+                    updates += 1
+                    tau = config.tau if updates % config.gradient_steps_per_target == 0 else 0
+                    learn(unpack(rows[indices], (4,)), config.gamma, *agent.learner, tau=tau)
         epsilon = decay_epsilon(epsilon, config)
     assert updates == run.agent.num_updates > 400
     assert close_calls <= 2

@@ -33,6 +33,13 @@ def test_defaults_are_the_originals_numbers():
         "solved_window": 50,
         "hidden_units": (64,),
         "jit_compile": True,
+        # not in the original, and off
+        "num_steps": None,
+        "learning_starts": 0,
+        "steps_count_from": "episode",
+        "gradient_steps": 1,
+        "gradient_steps_per_target": 1,
+        "epsilon_steps": None,
     }
 
 
@@ -67,6 +74,12 @@ def test_rules_that_join_two_fields():
         Config(num_episodes=6, max_steps=10)
     with pytest.raises(ValueError, match=r"^epsilon_min .* 0.05, got 0.1"):
         Config(epsilon=0.05)
+    with pytest.raises(ValueError, match=r"^batch_size .*num_steps = 63, got 64"):
+        Config(num_steps=63)
+    with pytest.raises(ValueError, match=r"^learning_starts .*num_steps = 100, got 100"):
+        Config(num_steps=100, learning_starts=100)
+    with pytest.raises(ValueError, match=r"^decay .*epsilon_steps=10.* got 0.9"):
+        Config(epsilon_steps=10, decay=0.9)
 
 
 def test_numpy_scalars_become_pythons():

@@ -21,7 +21,7 @@ def test_every_argument_of_every_public_function_is_tried():
     names = set(dqn_keras.__all__) - RECORDS - {"environments", "__version__"}
     functions = {name: getattr(dqn_keras, name) for name in names}
     functions |= {f"ReplayMemory.{x}": getattr(dqn_keras.ReplayMemory, x) for x in ("append", "sample", "sample_rows")}
-    functions["Run.save"] = Run.save
+    functions |= {"Run.act": Run.act, "Run.save": Run.save}
     for name, function in functions.items():
         assert set(DOORS[name].claims) == set(inspect.signature(function).parameters) - {"self"}, name
 

@@ -7,6 +7,7 @@ from dqn_keras import Config
 from dqn_keras.agent import make_agent
 from dqn_keras.checks.environments import CheckedEnv
 from dqn_keras.loops.gymnasium import episodes
+from dqn_keras.policy import epsilon_at
 from dqn_keras.seeding import episode_seed
 from tests.helpers import original_algorithm
 from tests.helpers.environments import Corridor
@@ -47,13 +48,22 @@ OTHERS = {
     "epsilon_min": 0.2,
     "max_steps": 40,
 }
+PUBLISHED = {
+    "steps_per_update": 7,
+    "steps_count_from": "run",
+    "gradient_steps": 3,
+    "gradient_steps_per_target": 5,
+    "tau": 1.0,
+    "learning_starts": 300,
+    "epsilon_steps": 1_200,
+}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "parameters"),
-    [(0, {}), (1, {}), (2, {"memory_size": 500}), (3, OTHERS)],
-    ids=["seed 0", "seed 1", "full memory", "other parameters"],
+    [(0, {}), (1, {}), (2, {"memory_size": 500}), (3, OTHERS), (4, PUBLISHED)],
+    ids=["seed 0", "seed 1", "full memory", "other parameters", "a published rhythm"],
 )
 @pytest.mark.parametrize("jit_compile", [True, False], ids=["jit", "no jit"])
 def test_the_loop_is_the_originals_algorithm_step_for_step(cartpole, seed, parameters, jit_compile):
@@ -91,6 +101,35 @@ def test_updates_fall_on_every_fourth_step_of_an_episode_once_a_batch_is_there()
     assert [np.isnan(e.loss) for e in played] == [True, False, False]
     assert agent.num_updates == 1 + 2
     assert agent.optimizer.iterations.numpy() == 3
+
+
+def test_updates_can_follow_the_steps_of_the_run_and_start_late():
+    # episodes of 6 steps; updates after the run's steps 8, 12, 16, ..., the first with more than 10 steps at step 12
+    env = Corridor(length=100, limit=6)
+    config = Config(batch_size=2, steps_count_from="run", learning_starts=10, gradient_steps=3, num_steps=18)
+    agent, played = play(env, config, 0, 18)
+    assert [np.isnan(e.loss) for e in played] == [True, True, False]
+    assert agent.num_updates == agent.optimizer.iterations.numpy() == 2 * 3
+
+
+def test_q_hat_is_a_copy_that_stays_for_a_number_of_gradient_steps():
+    config = Config(batch_size=2, steps_per_update=1, gradient_steps_per_target=5, tau=1.0, num_steps=40)
+    checked = CheckedEnv(Corridor(length=100, limit=1))  # after step k, k - 1 gradient steps
+    agent = make_agent((2,), 2, config, 0)
+    q, q_hat = [agent.q_network.get_weights()], []
+    for _ in episodes(checked, agent, config):
+        q_hat.append(agent.q_hat_network.get_weights())
+        if agent.num_updates:
+            q.append(agent.q_network.get_weights())
+    for num_updates, weights in enumerate(q_hat[1:], start=1):
+        for a, b in zip(weights, q[num_updates - num_updates % 5], strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_epsilon_falls_in_a_straight_line_after_random_steps():
+    config = Config(epsilon_steps=10, epsilon_min=0.5, learning_starts=4, batch_size=1)
+    assert [epsilon_at(step, 0.3, config) for step in (0, 3, 4, 5, 10, 99)] == [1, 1, 0.8, 0.75, 0.5, 0.5]
+    assert epsilon_at(4, 0.3, Config(learning_starts=4)) == 0.3
 
 
 def test_truncation_keeps_the_bootstrap_and_termination_does_not():

@@ -38,6 +38,17 @@ def q_function(q_network: keras.Model) -> Callable[[np.ndarray], np.ndarray]:
     return lambda state: compiled(tf.constant(state[None])).numpy()[0]
 
 
+def q_values_now(q_network: keras.Model, state: np.ndarray) -> np.ndarray:
+    """Returns Q(s, .) [A] of one state [*S] with the weights that `q_network` has now.
+
+    A call takes about 0.2 ms for a network that NumPy can compute: reading the weights takes most of it. Any other
+    network takes about 0.5 ms in Keras' own compiled function, which the first call makes.
+    """
+    if is_relu_mlp(q_network):
+        return q_values(q_network.get_weights(), state)
+    return q_network.predict_on_batch(state[None])[0]
+
+
 def is_relu_mlp(q_network: keras.Model) -> bool:
     """Returns whether `q_values` can compute this network: dense layers with ReLU, and a linear last layer."""
     if type(q_network) is not keras.Sequential or "call" in vars(q_network):

@@ -9,12 +9,25 @@ from dqn_keras.checks.numbers import shown
 
 T = TypeVar("T")
 
+_PER_TARGET = "gradient_steps_per_target"
+
+
 OTHER_NAMES = {
     "learning_rate": ("learning rate", "alpha"),
     "lr": ("learning rate", "alpha"),
     "discount": ("discount factor", "gamma"),
     "discount_factor": ("discount factor", "gamma"),
     "target_update": ("share of Q in each update of Q-hat", "tau"),
+    "target_update_interval": ("number of gradient steps from one update of Q-hat to the next", _PER_TARGET),
+    "target_network_frequency": ("number of gradient steps from one update of Q-hat to the next", _PER_TARGET),
+    "steps_per_target": ("number of gradient steps from one update of Q-hat to the next", _PER_TARGET),
+    "train_freq": ("number of environment steps per update", "steps_per_update"),
+    "train_frequency": ("number of environment steps per update", "steps_per_update"),
+    "total_timesteps": ("maximum number of environment steps", "num_steps"),
+    "exploration_fraction": ("number of environment steps over which epsilon falls", "epsilon_steps"),
+    "exploration_initial_eps": ("first value of epsilon", "epsilon"),
+    "exploration_final_eps": ("lowest value of epsilon", "epsilon_min"),
+    "net_arch": ("number of units of each hidden layer", "hidden_units"),
     "epsilon_start": ("first value of epsilon", "epsilon"),
     "epsilon_max": ("first value of epsilon", "epsilon"),
     "epsilon_end": ("lowest value of epsilon", "epsilon_min"),

@@ -92,6 +92,13 @@ def check_flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
+    """Returns `value` if it is one of the words in `choices`; otherwise raises ValueError."""
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {shown(value)}")
+    return value
+
+
 def check_instance(name: str, value: Any, kind: Any, what: str) -> None:
     """Raises TypeError unless `value` is of the class `kind`, described by `what`."""
     if not isinstance(value, kind):

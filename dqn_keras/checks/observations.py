@@ -8,6 +8,8 @@ from typing import Any, SupportsFloat
 import numpy as np
 
 from dqn_keras.agent import Agent, DivergedError
+from dqn_keras.checks.numbers import shown
+from dqn_keras.config import Config
 from dqn_keras.metrics import Episode
 
 
@@ -20,6 +22,28 @@ def as_numbers(value: Any) -> np.ndarray | None:
     except Exception:  # whatever the array's own library raises
         return None
     return array if np.can_cast(array.dtype, np.float32, "same_kind") else None
+
+
+def check_state(name: str, value: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """Returns one state as an array of `shape` and `dtype`, float32 or uint8; otherwise raises an error that names it.
+
+    Raises:
+        TypeError: `value` is not an array of numbers.
+        ValueError: it has another shape, a value that is not finite in float32, or a dtype other than uint8 if the
+            states are uint8.
+    """
+    numbers = as_numbers(value)
+    if numbers is None:
+        raise TypeError(f"{name} must be an array of numbers, got {shown(value)}")
+    if numbers.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {numbers.shape}")
+    if dtype == np.uint8 != numbers.dtype:
+        raise ValueError(f"{name} must be of dtype uint8, as the observations of env, got {numbers.dtype}")
+    with np.errstate(over="ignore"):
+        state = numbers.astype(dtype)
+    if not np.isfinite(state).all():
+        raise ValueError(f"{name} must be finite in float32, got {shown(value)}")
+    return state
 
 
 def as_float(value: Any) -> float | None:
@@ -73,13 +97,12 @@ class Watch:
         self._num_to_see -= 1
         return self._num_to_see > 0
 
-    def over(self, episodes: Iterator[Episode], agent: Agent, num_episodes: int) -> Generator[Episode, None, None]:
+    def over(self, episodes: Iterator[Episode], agent: Agent, config: Config) -> Generator[Episode, None, None]:
         """Yields the same episodes, and looks at the agent's memory once: after 1,000 states, or else at the end."""
         before, is_done = agent.memory.num_appended, False
         try:
             for episode in episodes:
-                is_over = agent.memory.num_appended - before >= _NUM_STATES or episode.number + 1 == num_episodes
-                if is_over and not is_done:
+                if not is_done and (agent.memory.num_appended - before >= _NUM_STATES or agent.is_done(config)):
                     is_done = True
                     self._look(agent)
                 yield episode

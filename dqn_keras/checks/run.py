@@ -14,11 +14,12 @@ from gymnasium.experimental.functional import FuncEnv
 from dqn_keras._engine.private import arguments_of_compile
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import owners_optimizer
-from dqn_keras.checks.environments import no_env, spaces_of
+from dqn_keras.checks.environments import Spaces, env_name, no_env, spaces_of
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.checks.networks import check_optimizer, warn_of_inference_mode
 from dqn_keras.checks.numbers import check_count, check_flag, check_instance, check_path, check_sequence, shown
 from dqn_keras.config import Config
+from dqn_keras.evaluation import Evaluation
 
 
 def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> None:
@@ -34,15 +35,41 @@ def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> Non
 
 
 def check_callbacks(
-    callbacks: keras.callbacks.Callback | Sequence[keras.callbacks.Callback] | None,
+    callbacks: keras.callbacks.Callback | Sequence[keras.callbacks.Callback] | None, env: gym.Env | FuncEnv
 ) -> list[keras.callbacks.Callback]:
-    """Returns no, one or several callbacks as a list; raises TypeError if one is not a Keras callback."""
+    """Returns no, one or several callbacks as a list.
+
+    Raises:
+        TypeError: one is not a Keras callback.
+        ValueError: there are two Evaluations, or one that does not fit the environment `env` of the run.
+    """
     if callbacks is None or isinstance(callbacks, keras.callbacks.Callback):
-        return [] if callbacks is None else [callbacks]
+        callbacks = [] if callbacks is None else [callbacks]
     check_instance("callbacks", callbacks, list | tuple, "a Keras callback or a list of them")
     for callback in callbacks:
         check_instance("callbacks", callback, keras.callbacks.Callback, "Keras callbacks")
+    evaluations = [callback for callback in callbacks if isinstance(callback, Evaluation)]
+    if len(evaluations) > 1:
+        raise ValueError(f"callbacks must hold one Evaluation, as there is one greedy_return, got {len(evaluations)}")
+    for evaluation in evaluations:
+        _check_evaluation(evaluation, env)
     return list(callbacks)
+
+
+def _check_evaluation(evaluation: Evaluation, env: gym.Env | FuncEnv) -> None:
+    """Raises ValueError unless the evaluation has an environment of its own with the states and actions of `env`."""
+    if isinstance(env, gym.Env) and evaluation.env.unwrapped is env.unwrapped:
+        raise ValueError(
+            f"callbacks must evaluate in an environment of their own, got an Evaluation in env {env_name(env)} itself: "
+            "make a second one"
+        )
+    wanted, got = (spaces._replace(first_action=0) for spaces in (spaces_of(env), evaluation.spaces))
+    if got != wanted:
+        raise ValueError(f"callbacks must evaluate in an environment like env, {_sizes(wanted)}, got {_sizes(got)}")
+
+
+def _sizes(spaces: Spaces) -> str:
+    return f"with {spaces.state_dtype} states of shape {spaces.state_shape} and {spaces.num_actions} actions"
 
 
 def check_checkpoint(checkpoint: str | os.PathLike | None, checkpoint_every: int, resume: bool) -> int:

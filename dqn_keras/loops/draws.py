@@ -78,6 +78,14 @@ def _first_in_random_order(num: int, most: int, key: tf.Tensor, counter: Any, si
 _NEXT_ATTEMPT = 2**32  # larger than the number of any turn
 
 
+def further_draws(counter: tf.Tensor, k: tf.Tensor) -> tf.Tensor:
+    """Returns the counter of the k-th gradient step of a turn that has several."""
+    return tf.cast(counter, tf.int64) + k * _NEXT_GRADIENT_STEP
+
+
+_NEXT_GRADIENT_STEP = 2**44  # larger than that of any attempt
+
+
 def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:
     """Returns the int64 number that determines all draws of an episode."""
     return tf.bitcast(draw_bits(2, key, episode), tf.int64)

@@ -19,9 +19,9 @@ from dqn_keras.checks.environments import CheckedEnv
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
 from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, packages
-from dqn_keras.loops.updates import checked_step, sum_up
+from dqn_keras.loops.updates import checked_step, num_before_updates, sum_up
 from dqn_keras.metrics import Episode
-from dqn_keras.policy import decay_epsilon, epsilon_greedy
+from dqn_keras.policy import epsilon_at, epsilon_greedy, epsilon_of_next_episode
 from dqn_keras.replay import Experience, unpack
 from dqn_keras.seeding import episode_seed
 
@@ -32,39 +32,50 @@ def episodes(
     """Plays and learns until the run's last episode, and yields each episode; `agent` is changed in place."""
     kind = _InNumPy if is_relu_mlp(agent.q_network) else _InTensorFlow
     q = kind(agent, config, formulas)
-    while len(agent.episodes) < config.num_episodes:
+    while not agent.is_done(config):
         agent.episodes.append(_play_episode(env, agent, config, q))
         yield agent.episodes[-1]
 
 
 def _play_episode(env: CheckedEnv, agent: Agent, config: Config, q: "_InNumPy | _InTensorFlow") -> Episode:
-    number, epsilon, memory, rng = len(agent.episodes), agent.epsilon, agent.memory, agent.rng
-    total_reward, max_reward, metrics, t, terminated = 0.0, -math.inf, [], 0, False
+    number, epsilon, memory = len(agent.episodes), agent.epsilon, agent.memory
+    total_reward, max_reward, metrics, t, is_over, terminated = 0.0, -math.inf, [], 0, False, False
+    first_step = memory.num_appended  # of the run; t counts from it
+    before = first_step if config.steps_count_from == "run" else 0
     q.read_weights()
 
     state = env.reset(episode_seed(agent.seed, number), number)
-    for t in range(config.max_steps):
-        a = epsilon_greedy(q.values(state), epsilon, rng)
+    for t in range(min(config.max_steps, (config.num_steps or math.inf) - first_step)):
+        a = epsilon_greedy(q.values(state), epsilon_at(first_step + t, epsilon, config), agent.rng)
         next_state, reward, terminated, truncated = env.step(a)
         memory.append_unchecked(Experience(state, a, reward, next_state, terminated))
         total_reward += reward
         max_reward = max(max_reward, reward)
 
-        if t % config.steps_per_update == 0 and len(memory) >= config.batch_size:
-            metrics.append(q.update(memory.sample_rows(config.batch_size, rng)))
-            if not math.isfinite(metrics[-1].loss):
-                raise DivergedError(
-                    f"the loss or a weight is not finite in episode {number}, step {t}: learning has diverged"
-                )
+        if (before + t) % config.steps_per_update == 0 and memory.num_appended >= num_before_updates(config):
+            for _ in range(config.gradient_steps):
+                metrics.append(_update(agent, config, q))
+                if not math.isfinite(metrics[-1].loss):
+                    raise DivergedError(
+                        f"the loss or a weight is not finite in episode {number}, step {t}: learning has diverged"
+                    )
 
         state = next_state
-        if terminated or truncated:
+        is_over = terminated or truncated or t + 1 == config.max_steps
+        if is_over:
             break
 
-    agent.num_updates += len(metrics)
-    agent.epsilon = decay_epsilon(epsilon, config)
-    loss, mean_q, max_q, td_error = sum_up(metrics)
-    return Episode(number, total_reward, t + 1, epsilon, loss, mean_q, max_q, td_error, max_reward, terminated)
+    agent.epsilon = epsilon_of_next_episode(epsilon, config)
+    total_reward = total_reward if is_over else math.nan  # num_steps has cut the episode short
+    epsilon = epsilon_at(first_step, epsilon, config)
+    return Episode(number, total_reward, t + 1, epsilon, *sum_up(metrics), max_reward, terminated)
+
+
+def _update(agent: Agent, config: Config, q: "_InNumPy | _InTensorFlow") -> Metrics:
+    """Takes one gradient step on a batch from the memory; Q-hat moves only if it is due."""
+    agent.num_updates += 1
+    is_due = agent.num_updates % config.gradient_steps_per_target == 0
+    return q.update(agent.memory.sample_rows(config.batch_size, agent.rng), config.tau if is_due else 0.0)
 
 
 class _InNumPy:
@@ -86,9 +97,9 @@ class _InNumPy:
         """Returns Q(s, .), [A]."""
         return q_values(self._weights, state)
 
-    def update(self, rows: np.ndarray) -> Metrics:
+    def update(self, rows: np.ndarray, tau: float) -> Metrics:
         """Takes a gradient step on rows of the memory and returns its metrics."""
-        flat = self._step(self._as_tensor(rows))[0].numpy()
+        flat = self._step(self._as_tensor(rows), tau)[0].numpy()
         parts = zip(self._ends, self._ends[1:], self._shapes, strict=False)
         self._weights = [flat[i:j].reshape(shape) for i, j, shape in parts]
         return Metrics(*flat[: self._ends[0]].tolist())
@@ -114,18 +125,18 @@ class _InTensorFlow:
         """Returns Q(s, .), [A]."""
         return self._values(self._as_tensor(state))[0].numpy()
 
-    def update(self, rows: np.ndarray) -> Metrics:
+    def update(self, rows: np.ndarray, tau: float) -> Metrics:
         """Takes a gradient step on rows of the memory and returns its metrics."""
-        return Metrics(*self._step(self._as_tensor(rows))[0].numpy().tolist())
+        return Metrics(*self._step(self._as_tensor(rows), tau)[0].numpy().tolist())
 
 
 def _bind_step(
     agent: Agent, config: Config, formulas: Formulas, gives_weights: bool
-) -> Callable[[tf.Tensor], list[tf.Tensor]]:
+) -> Callable[[tf.Tensor, float], list[tf.Tensor]]:
     """Returns the gradient step: rows of the memory -> a vector of its metrics and, if wanted, Q's new weights.
 
-    The step has only two inputs and one output, because each additional array costs as much as its share of the
-    arithmetic.
+    It also takes tau, which is `config.tau` or 0. The compiled step has only two inputs and one output, because each
+    additional array costs as much as its share of the arithmetic.
     """
     rows, state_shape = agent.memory.rows, agent.memory.state_shape
 
@@ -147,5 +158,5 @@ def _bind_step(
         has_own_parts=packages(formulas) is None,
         jit_compile=config.jit_compile,
     )
-    numbers = tf.constant([config.gamma, config.tau], tf.float32)
-    return lambda rows: step(rows, numbers)
+    numbers = {tau: tf.constant([config.gamma, tau], tf.float32) for tau in (config.tau, 0.0)}
+    return lambda rows, tau: step(rows, numbers[tau])

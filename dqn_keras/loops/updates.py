@@ -7,6 +7,7 @@ from typing import Any
 from dqn_keras._engine.programs import Learner
 from dqn_keras._engine.tensorflow import tf
 from dqn_keras.checks.formulas import Formulas
+from dqn_keras.config import Config
 from dqn_keras.learn import Metrics, gradient_step
 from dqn_keras.replay import Experience
 
@@ -16,6 +17,11 @@ def checked_step(experiences: Experience, learner: Learner, gamma: Any, tau: Any
     metrics = gradient_step(experiences, gamma, *learner, tau, formulas)
     loss = tf.where(is_all_finite(*learner.q_network.weights), metrics.loss, math.nan)
     return metrics._replace(loss=loss)
+
+
+def num_before_updates(config: Config) -> int:
+    """Returns the number of transitions of a run from which on it updates."""
+    return max(config.batch_size, config.learning_starts + 1)
 
 
 def sum_up(metrics: Sequence[Metrics]) -> Metrics:

@@ -199,7 +199,7 @@ def _restore(agent: Agent, others: Sequence[tf.Variable], arrays: dict[str, np.n
     expected |= {f"episodes/{name}": np.zeros(max(0, episodes_played), dtype) for name, dtype in _COLUMNS.items()}
     expected["memory"] = agent.memory.rows[:num_appended]
     # A run continues if one of Adam's averages overflows, as long as the weights are finite.
-    may_be_infinite = {f"episodes/{name}" for name in Metrics._fields} | {
+    may_be_infinite = {f"episodes/{name}" for name in (*Metrics._fields, "reward")} | {
         name for name in expected if name.startswith(("optimizer/", "other/"))
     }
     if names := sorted(expected.keys() ^ arrays.keys()):
@@ -213,6 +213,8 @@ def _restore(agent: Agent, others: Sequence[tf.Variable], arrays: dict[str, np.n
         parts = unpack(array, agent.memory.state_shape) if name == "memory" else [array]
         if name not in may_be_infinite and not all(np.isfinite(x).all() for x in parts):
             raise DamagedError(f"{name} holds a number that is not finite")
+    if not np.isfinite(arrays["episodes/reward"][:-1]).all():
+        raise DamagedError("episodes/reward holds a number that is not finite")
     if arrays["episodes/steps"].sum() != num_appended or not 0 <= epsilon <= 1:
         raise DamagedError("its counts do not belong together")
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from dqn_keras.version import __version__
 
-FORMAT = 5
+FORMAT = 6
 
 
 class DamagedError(ValueError):

@@ -6,7 +6,10 @@ from hypothesis import strategies as st
 
 from dqn_keras import Config
 
-COUNTS = ["memory_size", "steps_per_update", "batch_size", "num_episodes", "max_steps", "solved_window"]
+COUNTS = [
+    *("memory_size", "steps_per_update", "batch_size", "num_episodes", "max_steps", "solved_window"),
+    *("gradient_steps", "gradient_steps_per_target"),
+]
 SHARES = ["alpha", "gamma", "tau", "epsilon", "decay", "epsilon_min"]
 
 
@@ -30,6 +33,9 @@ bad_hidden_units = st.one_of(not_finite, st.lists(bad_counts, min_size=1, max_si
 bad_fields = st.one_of(
     st.tuples(st.sampled_from(COUNTS), bad_counts),
     st.tuples(st.sampled_from(SHARES), bad_shares),
-    st.tuples(st.just("solved_reward"), st.one_of(not_numbers, not_finite)),
+    st.tuples(st.just("solved_reward"), st.one_of(not_numbers.filter(lambda x: x is not None), not_finite)),
+    st.tuples(st.sampled_from(["num_steps", "epsilon_steps"]), bad_counts.filter(lambda x: x is not None)),
+    st.tuples(st.just("learning_starts"), bad_counts.filter(lambda x: x != 0 or x is False)),
+    st.tuples(st.just("steps_count_from"), st.sampled_from([None, "Episode", "", "update", 1, b"run", ["run"]])),
     st.tuples(st.just("jit_compile"), st.sampled_from([1, 0, None, "yes", 1.0, np.int64(1)])),
 )

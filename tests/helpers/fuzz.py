@@ -424,6 +424,16 @@ def network_doors() -> Iterator[tuple[str, Door]]:
     )
 
 
+def evaluation_at_the_start(**arguments: Any) -> None:
+    evaluation = dqn_keras.Evaluation(**arguments)
+    evaluation.set_model(shared()["q"])
+    evaluation.on_train_begin()
+
+
+def act(state: Any) -> None:
+    shared()["run"].act(state)
+
+
 def acting_doors() -> Iterator[tuple[str, Door]]:
     yield (
         "action",
@@ -453,26 +463,32 @@ def acting_doors() -> Iterator[tuple[str, Door]]:
         Door(dqn_keras.episode_seed, lambda: {"seed": 0, "episode": 0}, {"seed": count(0), "episode": count(0)}),
     )
     arguments = {"num_episodes": 1, "seed": 0, "max_steps": 3}
-    claims = {
-        "env": is_a(Corridor),
-        "q_network": named("a right network", *UNUSUAL),
-        "seed": seed,
-        "max_steps": count(),
-    }
+    claims = {"env": is_a(Corridor), "seed": seed, "max_steps": count()}
+    right = {"q_network": named("a right network", *UNUSUAL)}
     yield (
         "evaluate",
         Door(
             dqn_keras.evaluate,
             lambda: {"env": Corridor(3, 3), "q_network": shared()["q"], **arguments},
-            {**claims, "num_episodes": count()},
+            {**claims, **right, "num_episodes": count()},
         ),
     )
+    yield (
+        "Evaluation",
+        Door(
+            evaluation_at_the_start,
+            lambda: {"env": Corridor(3, 3), "every_steps": 5, "best": "x.keras", **arguments},
+            {**claims, "every_steps": count(), "best": no_value, "num_episodes": count()},
+        ),
+    )
+    states = named("zeros(2)", "a tensor [2]", "[1, 2]", "an array of booleans")
+    yield "Run.act", Door(act, lambda: {"state": np.zeros(2)}, {"state": states})
     yield (
         "record_episode",
         Door(
             dqn_keras.record_episode,
             lambda: {"env": Rendered(3, 3), "q_network": shared()["q"], "seed": 0, "max_steps": 3},
-            {**claims, "env": nothing},
+            {**claims, **right, "env": nothing},
         ),
     )
 
