@@ -24,7 +24,7 @@ import keras
 import numpy as np
 import scipy
 
-from dqn_keras import Config, train
+from dqn_keras import Config, make_q_network, train
 from dqn_keras.environments import TWINS
 from dqn_keras.statistics import Estimate
 
@@ -87,21 +87,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20, help="at most seeds 0, 1, ... (20 of CartPole, 10 of others)")
     parser.add_argument("--programs", nargs="+", choices=PROGRAMS, default=list(PROGRAMS))
+    names = [settings.environment for settings in ZOO]
+    parser.add_argument("--environments", nargs="+", choices=names, default=names)
     arguments = parser.parse_args()
-    for program, settings, seed in missing_runs(arguments.programs, arguments.seeds):
+    for program, settings, seed in missing_runs(arguments.programs, arguments.environments, arguments.seeds):
         record = PROGRAMS[program].run(program, settings, seed)
         print(record, file=sys.stderr, flush=True)
         append_record(record)
     print_page(read_records())
 
 
-def missing_runs(programs: list[str], max_seeds: int) -> Iterator[tuple[str, Settings, int]]:
+def missing_runs(programs: list[str], environments: list[str], max_seeds: int) -> Iterator[tuple[str, Settings, int]]:
     """Yields the runs that the file lacks, one seed of every environment after the other."""
     done = {(record.program, record.environment, record.seed) for record in read_records()}
     for seed in range(max_seeds):
         for program in programs:
             for settings in PROGRAMS[program].settings:
-                if seed < settings.num_seeds and (program, settings.environment, seed) not in done:
+                is_wanted = settings.environment in environments and seed < settings.num_seeds
+                if is_wanted and (program, settings.environment, seed) not in done:
                     yield program, settings, seed
 
 
@@ -156,22 +159,37 @@ def run_stable_baselines3(program: str, settings: Settings, seed: int) -> Record
     return make_record(program, settings, seed, agent.num_timesteps, greedy, training_returns, seconds)
 
 
-def run_dqn_keras(program: str, settings: Settings, seed: int) -> Record:
-    """Trains and evaluates this package's DQN."""
+def run_dqn_keras(program: str, settings: Settings, seed: int, q_network: keras.Model | None = None) -> Record:
+    """Trains and evaluates this package's DQN, from the network that it makes or from one that it is given."""
     start = time.perf_counter()
     env = TWINS[settings.environment]() if settings.environment in TWINS else gym.make(settings.environment)
     optimizer = keras.optimizers.Adam(settings.learning_rate, epsilon=1e-8, global_clipnorm=settings.clipnorm)
-    run = train(env, config_of(settings), seed, optimizer=optimizer, loss=settings.loss, verbose=0)
+    run = train(env, config_of(settings), seed, q_network=q_network, optimizer=optimizer, loss=settings.loss, verbose=0)
     seconds = time.perf_counter() - start
     num_env_steps = sum(episode.steps for episode in run.episodes)
     greedy = greedy_returns(settings.environment, lambda states: np.argmax(run.q_network(states), axis=-1))
-    return make_record(program, settings, seed, num_env_steps, greedy, run.rewards, seconds)
+    complete = run.rewards[~np.isnan(run.rewards)]  # num_steps cuts the last one short
+    return make_record(program, settings, seed, num_env_steps, greedy, complete, seconds)
+
+
+def run_from_torch_start(program: str, settings: Settings, seed: int) -> Record:
+    """Does what `run_dqn_keras` does, from weights and biases that are distributed as in torch's Linear."""
+    with gym.make(settings.environment) as env:
+        q_network = make_q_network(env.observation_space.shape[0], int(env.action_space.n), settings.hidden_units)
+    rng = np.random.default_rng(seed)
+    for layer in q_network.layers:
+        bound = 1 / math.sqrt(layer.kernel.shape[0])
+        layer.set_weights([rng.uniform(-bound, bound, weights.shape) for weights in layer.get_weights()])
+    return run_dqn_keras(program, settings, seed, q_network)
 
 
 def config_of(settings: Settings) -> Config:
     """Returns the settings as this package's Config; the learning rate is the optimizer's."""
-    # Stable-Baselines3, too, ends with a whole round: 50,176 steps of CartPole.
-    num_steps = math.ceil(settings.num_steps / settings.steps_per_update) * settings.steps_per_update
+    # Stable-Baselines3 counts steps from 1 and ends with an update, after 50,176 steps of CartPole. Here, the step with
+    # that update is the one of index 50,176.
+    num_steps = math.ceil(settings.num_steps / settings.steps_per_update) * settings.steps_per_update + 1
+    # A target that is copied more often than Q changes is copied once per round of updates.
+    steps_per_target = max(settings.steps_per_target, settings.steps_per_update)
     return Config(
         num_steps=num_steps,
         num_episodes=num_steps,
@@ -182,7 +200,7 @@ def config_of(settings: Settings) -> Config:
         steps_count_from="run",
         steps_per_update=settings.steps_per_update,
         gradient_steps=settings.gradient_steps,
-        steps_per_target=settings.steps_per_target,
+        gradient_steps_per_target=steps_per_target * settings.gradient_steps // settings.steps_per_update,
         tau=1.0,
         epsilon_steps=round(settings.epsilon_fraction * settings.num_steps),
         epsilon_min=settings.epsilon_min,
@@ -233,6 +251,7 @@ class Program(NamedTuple):
 PROGRAMS = {
     "stable_baselines3": Program(run_stable_baselines3, ZOO),
     "dqn_keras": Program(run_dqn_keras, ZOO),
+    "dqn_keras_torch_start": Program(run_from_torch_start, ZOO),
     "dqn_keras_cleanrl": Program(run_dqn_keras, (CLEANRL,)),
 }
 
