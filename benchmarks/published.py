@@ -262,16 +262,17 @@ def print_page(records: list[Record]) -> None:
     versions = ", ".join(f"{package} {importlib.metadata.version(package)}" for package in packages)
     print(f"""# Published tables of DQN, run again
 
-`python -m benchmarks.published`, one core (Python {platform.python_version()}, {versions}). Every run:
-[published.csv](published.csv).
+`python -m benchmarks.published`, one core (Python {platform.python_version()}, {versions}).
+Every run: [published.csv](published.csv).
 
 The settings are rl-zoo3's (`hyperparams/dqn.yml`). "Published" is sb3-contrib's table for them
 (`docs/modules/qrdqn.md`): the mean over 3 to 5 seeds of 10 greedy episodes, ± the standard error. "SB3 here" is
-Stable-Baselines3's DQN and "dqn_keras" is this package, both with these settings.
+Stable-Baselines3's DQN, run with these settings. "torch's start" is this package, with networks that start as torch's
+do, and "Keras' start" is this package with its own networks.
 
-Each seed counts with its mean return. A cell holds the mean over the seeds (95 % interval, percentile bootstrap over
-the seeds) and, after the semicolon, the median. The last two columns are p-values of "the two programs are equal":
-Mann-Whitney U, and a permutation test of the difference of the means.
+A cell holds the mean over the seeds (from 5 seeds on, its 95 % interval, percentile bootstrap over the seeds), the
+median and the number of seeds; each seed counts with its mean return. In the columns p, this package is compared with
+"SB3 here": the p-values of Mann-Whitney's U, and of a permutation test of the difference of the means.
 """)
     measures = {
         "## 100 greedy episodes after training": "greedy_return",
@@ -286,24 +287,16 @@ Mann-Whitney U, and a permutation test of the difference of the means.
 
 def print_table(title: str, records: list[Record], measure: str) -> None:
     """Prints the environments under one measure."""
-    print(f"{title}\n\n| | published | SB3 here | seeds | dqn_keras | seeds | U test | means |")
-    print("|---|---|---|---|---|---|---|---|")
+    print(
+        f"{title}\n\n| | published | SB3 here | torch's start | p | Keras' start | p |\n|---|---|---|---|---|---|---|"
+    )
     for settings in ZOO:
-        published = settings.published if measure != "training_return" else ""
-        theirs, ours = (
-            returns_of(records, program, settings.environment, measure)
-            for program in ("stable_baselines3", "dqn_keras")
-        )
-        cells = (
-            settings.environment,
-            published,
-            show(theirs),
-            len(theirs),
-            show(ours),
-            len(ours),
-            *equality(theirs, ours),
-        )
-        print("|", " | ".join(map(str, cells)), "|")
+        theirs = returns_of(records, "stable_baselines3", settings.environment, measure)
+        cells = [settings.environment, settings.published if measure != "training_return" else "", show(theirs)]
+        for program in ("dqn_keras_torch_start", "dqn_keras"):
+            ours = returns_of(records, program, settings.environment, measure)
+            cells += [show(ours), equality(theirs, ours)]
+        print("|", " | ".join(cells), "|")
     print()
 
 
@@ -315,20 +308,20 @@ def print_cleanrl(returns: np.ndarray) -> None:
 500,000 steps with the settings of CleanRL's `dqn.py`. The measure is CleanRL's: the training return at epsilon 0.05,
 here over the last 100 episodes. CleanRL publishes 3 seeds.
 
-| published | dqn_keras | standard deviation over the seeds | seeds |
-|---|---|---|---|
-| {CLEANRL.published} | {show(returns)} | {deviation} | {len(returns)} |
+| published | Keras' start | standard deviation over the seeds |
+|---|---|---|
+| {CLEANRL.published} | {show(returns)} | {deviation} |
 """)
 
 
 DIFFERENCES = """## What is not the same
 
-- Both programs store a time limit as a truncation, and bootstrap from it. The published runs are of a day when
-  Stable-Baselines3 stored it as a terminal state. LunarLander was v2 then and is v3 here.
+- Both programs store a time limit as a truncation, and bootstrap from it. In the published runs,
+  Stable-Baselines3 still stored it as a terminal state. LunarLander was v2 then and is v3 here.
 - The memory: Stable-Baselines3 samples a batch with replacement, this package without. It learns only when the memory
   holds a whole batch.
-- The networks start differently: here Keras' default, Glorot uniform kernels and zero biases; in torch, both are
-  uniform in ±1/sqrt(number of inputs).
+- The networks start differently, except in the column "torch's start": Keras' kernels are Glorot uniform and its biases
+  zero; in torch, both are uniform in ±1/sqrt(number of inputs).
 - CartPole, Acrobot and MountainCar are this package's compiled twins in training, and Gymnasium's own in all greedy
   episodes. These start from the same 100 states for both programs.
 """
@@ -341,24 +334,24 @@ def returns_of(records: list[Record], program: str, environment: str, measure: s
 
 
 def show(returns: np.ndarray) -> str:
-    """Returns mean, interval and median of the seeds as text."""
+    """Returns mean, interval, median and number of the seeds as text."""
     if len(returns) == 0:
         return "-"
     low = high = math.nan
-    if len(np.unique(returns)) > 1:
+    if len(returns) >= 5 and len(np.unique(returns)) > 1:
         rng = np.random.default_rng(0)
         low, high = scipy.stats.bootstrap([returns], np.mean, method="percentile", rng=rng).confidence_interval
-    return f"{Estimate(float(np.mean(returns)), low, high)}; {np.median(returns):.1f}"
+    return f"{Estimate(float(np.mean(returns)), low, high)}; median {np.median(returns):.1f}; {len(returns)}"
 
 
-def equality(first: np.ndarray, second: np.ndarray) -> tuple[str, str]:
+def equality(first: np.ndarray, second: np.ndarray) -> str:
     """Returns the p-values of two tests that two samples have one distribution, as text."""
     if min(len(first), len(second)) < 2:
-        return "-", "-"
+        return "-"
     u_test = scipy.stats.mannwhitneyu(first, second)
     rng = np.random.default_rng(0)
     means = scipy.stats.permutation_test((first, second), difference_of_means, vectorized=True, rng=rng)
-    return f"{u_test.pvalue:.2g}", f"{means.pvalue:.2g}"
+    return f"{u_test.pvalue:.2g}, {means.pvalue:.2g}"
 
 
 def difference_of_means(first: np.ndarray, second: np.ndarray, axis: int) -> np.ndarray:
