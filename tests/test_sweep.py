@@ -271,6 +271,6 @@ def test_a_study_over_env_steps(swept):
     curves, distribution, shares = plot_study(swept["a"], x="env_steps")
     assert curves.get_xlabel() == "Environment steps"
     assert distribution.get_xlabel() == shares.get_xlabel().replace("steps", "steps to solved")
-    with warnings.catch_warnings(action="error"):
+    with warnings.catch_warnings(action="error", category=RuntimeWarning):
         curves.figure.canvas.draw()
     plt.close("all")
