@@ -351,7 +351,7 @@ def test_a_summary_worked_out_by_hand():
     assert summary.median.value == 305
     assert summary.interquartile_mean.value == (290 + 300 + 310 + 320) / 4
     assert summary.share_late.value == 2 / 8
-    assert summarize(outcomes, late_after=300).share_late.value == 5 / 8
+    assert summarize(outcomes, late_after=300).share_late.value == 4 / 8
     for estimate in summary[1:4]:
         assert estimate.low < estimate.value < estimate.high
     assert np.isnan(summary.greedy_return.value)
