@@ -71,9 +71,9 @@ class Evaluation(keras.callbacks.Callback):
     as without the callback. In compiled episodes, it makes each episode a call of its own, as most callbacks do.
 
     The mean return is logged as `greedy_return`: in `run.history`, and for all other callbacks, wherever they stand in
-    the list. Each episode logs that of the latest evaluation, because Keras' callbacks would keep a NaN as their best
-    value. So `EarlyStopping("greedy_return", mode="max", patience=...)` counts its patience in episodes. The evaluation
-    at the end comes after the last episode's log.
+    the list. An episode without an evaluation logs the mean return of the latest one, not NaN: a NaN that comes first
+    would stay the best value of Keras' callbacks. So `EarlyStopping("greedy_return", mode="max", patience=...)` counts
+    its patience in episodes. The evaluation at the end comes after the last episode's log.
 
     A resumed run evaluates the network in `best` first, and replaces it only by a better one. A new run replaces it.
 
