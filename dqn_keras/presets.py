@@ -18,6 +18,18 @@ presets: dict[str, Config] = {
         solved_reward=-100,
         solved_window=100,
     ),
+    "MountainCar-v0": Config(
+        alpha=0.002,
+        gamma=0.99,
+        tau=1.0,
+        gradient_steps_per_target=200,
+        epsilon=0.1,
+        epsilon_min=0.01,
+        epsilon_steps=10_000,
+        hidden_units=(64, 64),
+        solved_reward=-110,
+        solved_window=100,
+    ),
     "LunarLander-v3": Config(
         alpha=0.001,
         gamma=0.99,
