@@ -3,7 +3,7 @@
     python docs/snapshots.py [FILE]
 
 It trains as the lesson does, with seed 0, and writes docs/assets/snapshots.js. That is JSON behind `const RUN =`,
-because a page that is opened from a folder may load scripts but not fetch files. Weights are rounded to four
+because a page that is opened from a folder may load scripts but not fetch files. Weights are rounded to five
 significant digits.
 """
 
@@ -72,8 +72,8 @@ def start_state(k: int) -> list[float]:
 
 
 def rounded(array: np.ndarray) -> np.ndarray:
-    """Returns the array with four significant digits, float64."""
-    return np.vectorize(lambda x: float(f"{x:.4g}"), otypes=[np.float64])(array)
+    """Returns the array with five significant digits, float64."""
+    return np.vectorize(lambda x: float(f"{x:.5g}"), otypes=[np.float64])(array)
 
 
 def write(contents: dict[str, Any], file: Path) -> None:

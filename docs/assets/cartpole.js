@@ -48,7 +48,11 @@ function isTerminal(state) {
 
 /** One dense layer: inputs [F], kernel [F][U], bias [U] -> [U]. */
 function dense(inputs, kernel, bias) {
-  return bias.map((b, unit) => inputs.reduce((sum, input, i) => sum + input * kernel[i][unit], b));
+  const outputs = [...bias];
+  for (let i = 0; i < inputs.length; i++) {
+    for (let unit = 0; unit < outputs.length; unit++) outputs[unit] += inputs[i] * kernel[i][unit];
+  }
+  return outputs;
 }
 
 /** [Q(s, left), Q(s, right)], from the weights as Keras gives them: kernel and bias of each layer. */

@@ -2,9 +2,8 @@
 "use strict";
 
 (() => {
-  const PUSH_FORCE = 15; // N, on top of the network's
   const PUSH_STEPS = 5; // a push takes at least this many
-  const REST_STEPS = 40; // from the end of an episode to the next
+  const REST_STEPS = 30; // from the end of an episode to the next
   const TRAIL_STEPS = 50;
   const DEGREES = 180 / Math.PI;
   const MAP_VELOCITY = 3; // rad/s, the upper edge of the map
@@ -51,7 +50,7 @@
     }
     const force = forceOf(greedyAction(qValues(RUN.snapshots[chosen].weights, state)));
     previous = state;
-    state = transition(state, force + PUSH_FORCE * pushDirection());
+    state = transition(state, force + FORCE * pushDirection());
     push.steps -= 1;
     numSteps += 1;
     trail = [...trail.slice(1 - TRAIL_STEPS), state];
@@ -124,6 +123,7 @@
   function chooseByHand(index) {
     find("#film").checked = false;
     followFilm();
+    show("result", "");
     choose(Math.max(0, Math.min(index, RUN.snapshots.length - 1)));
   }
 
@@ -147,7 +147,7 @@
     find("#push").setAttribute("class", pushDirection() === 0 ? "hidden" : "");
     find("#push").setAttribute("transform", `scale(${push.direction || 1} 1)`);
     const [position, velocity, angle, angularVelocity] = state;
-    show("step", numSteps);
+    show("step", `${numSteps} / ${MAX_STEPS}`);
     show("position", fixed(position, 2));
     show("velocity", fixed(velocity, 2));
     show("angle", fixed(angle * DEGREES, 1));
