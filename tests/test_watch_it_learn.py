@@ -181,7 +181,7 @@ def test_a_thousand_steps_of_the_javascript_are_gymnasiums_and_the_packages(scri
     assert {bool(x) for x in np.abs(next_states[terminated][:, 0]) > 2.4} == {True, False}  # both ends occur
 
 
-def test_the_q_values_of_the_javascript_are_kerass(scripts, gymnasium_steps):
+def test_the_q_values_of_the_javascript_are_those_of_keras(scripts, gymnasium_steps):
     states = gymnasium_steps[0].astype(np.float32)
     for number, snapshot in enumerate(RUN["snapshots"]):
         ours, actions = scripts.evaluate(
@@ -279,7 +279,7 @@ def test_the_slider_its_keys_and_the_curve_choose_a_network_and_end_the_film(wat
     assert text(page, "#epsilon") == f"{100 * snapshot['epsilon']:.0f} %"
 
 
-def test_the_film_takes_the_next_network_after_each_fall(watch_page):
+def test_the_film_takes_the_next_network_after_each_episode(watch_page):
     page = watch_page("no-preference")
     page.wait_for_function("document.querySelector('#chosen').textContent === '20'", timeout=120_000)
     assert page.locator("#film").is_checked()
@@ -307,8 +307,9 @@ def test_the_bars_and_the_map_show_the_network(watch_page):
     page.locator("#episode").press("End")
     network = network_of(RUN["snapshots"][-1]["weights"])
     q = network(np.array([RUN["starts"][0]], np.float32)).numpy()[0]
-    assert [text(page, "#q-left output"), text(page, "#q-right output")] == [f"{value:.2f}" for value in q]
-    angles, velocities = np.radians(np.linspace(-12, 12, 49)), np.linspace(3, -3, 49)
+    assert [text(page, "#q-left .value"), text(page, "#q-right .value")] == [f"{value:.2f}" for value in q]
+    size = int(page.locator("#map").get_attribute("width"))
+    angles, velocities = np.radians(np.linspace(-12, 12, size)), np.linspace(3, -3, size)
     states = np.array([[0, 0, angle, velocity] for velocity in velocities for angle in angles], np.float32)
     pixels = """() => {
         const canvas = document.querySelector("#map");

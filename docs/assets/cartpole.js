@@ -48,7 +48,7 @@ function isTerminal(state) {
 
 /** One dense layer: inputs [F], kernel [F][U], bias [U] -> [U]. */
 function dense(inputs, kernel, bias) {
-  const outputs = [...bias];
+  const outputs = bias.slice();
   for (let i = 0; i < inputs.length; i++) {
     for (let unit = 0; unit < outputs.length; unit++) outputs[unit] += inputs[i] * kernel[i][unit];
   }

@@ -8,12 +8,13 @@
   const DEGREES = 180 / Math.PI;
   const MAP_VELOCITY = 3; // rad/s, the upper edge of the map
   const MAX_Q = 1 / (1 - RUN.gamma); // the highest possible return
-  const COLOURS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"]; // Matplotlib's viridis
+  const VIRIDIS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"]; // as in Matplotlib
   const LAST_EPISODE = RUN.rewards.length - 1;
 
   const find = (selector) => document.querySelector(selector);
   const show = (id, text) => (document.getElementById(id).textContent = text);
-  const fixed = (number, digits) => number.toFixed(digits).replace("-", "−");
+  /** A number with so many decimals, a true minus, and no minus before a zero. */
+  const fixed = (number, digits) => (Number(number.toFixed(digits)) + 0).toFixed(digits).replace("-", "−");
 
   let chosen = 0; // index in RUN.snapshots
   let start = 0; // index in RUN.starts
@@ -161,7 +162,7 @@
     ["#q-left", "#q-right"].forEach((bar, action) => {
       find(bar).classList.toggle("greedy", action === greedyAction(q));
       find(`${bar} b`).style.transform = `scaleX(${clip(q[action] / MAX_Q, 0, 1)})`;
-      find(`${bar} output`).textContent = fixed(q[action], 2);
+      find(`${bar} .value`).textContent = fixed(q[action], 2);
     });
   }
 
@@ -186,7 +187,7 @@
     const context = canvas.getContext("2d");
     const { weights, episode } = RUN.snapshots[chosen];
     const showsAction = find("[name=map]:checked").value === "action";
-    const colours = ["--left", "--right"].map((name) => rgb(getComputedStyle(canvas).getPropertyValue(name)));
+    const colours = ["--left", "--right"].map((name) => rgba(getComputedStyle(canvas).getPropertyValue(name).trim()));
     const image = context.createImageData(width, height);
     for (let row = 0; row < height; row++) {
       for (let column = 0; column < width; column++) {
@@ -194,7 +195,7 @@
         const angularVelocity = MAP_VELOCITY * (1 - (2 * row) / (height - 1));
         const q = qValues(weights, [0, 0, angle, angularVelocity]);
         const colour = showsAction ? colours[greedyAction(q)] : colourOf(Math.max(...q) / MAX_Q);
-        image.data.set([...colour, 255], 4 * (row * width + column));
+        image.data.set(colour, 4 * (row * width + column));
       }
     }
     context.putImageData(image, 0, 0);
@@ -214,13 +215,15 @@
 
   const clip = (x, low, high) => Math.max(low, Math.min(x, high));
   const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
-  const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.trim().slice(i, i + 2), 16));
+  const rgba = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16)).concat(255);
+
+  const VIRIDIS_RGBA = VIRIDIS.map(rgba);
 
   /** The colour of a share of the highest possible Q-value. */
   function colourOf(share) {
-    const place = clip(share, 0, 1) * (COLOURS.length - 1);
-    const i = Math.min(Math.floor(place), COLOURS.length - 2);
-    const [below, above] = [rgb(COLOURS[i]), rgb(COLOURS[i + 1])];
+    const place = clip(share, 0, 1) * (VIRIDIS.length - 1);
+    const i = Math.min(Math.floor(place), VIRIDIS.length - 2);
+    const [below, above] = [VIRIDIS_RGBA[i], VIRIDIS_RGBA[i + 1]];
     return below.map((value, channel) => value + (place - i) * (above[channel] - value));
   }
 
@@ -287,7 +290,7 @@
 
   find("#episode").max = LAST_EPISODE;
   show("last", LAST_EPISODE);
-  find("#colours").style.background = `linear-gradient(to right, ${COLOURS.join()})`;
+  find("#colours").style.background = `linear-gradient(to right, ${VIRIDIS.join()})`;
   drawCurve();
   listen();
   followFilm();
