@@ -2,8 +2,8 @@
 
 `make docs` runs it after the build. A page is wrong if it logs an error, asks another host for anything, has a picture
 that does not show or has no alt text, a link within the site that leads nowhere, or a formula left as LaTeX. The moving
-picture has to move, and the page "Watch it learn" to play. The search has to find, also when the site is opened from the
-disk.
+picture has to move, and the page "Watch it learn" to play. The search has to find, also when the site is opened from
+the disk.
 """
 
 import functools
