@@ -7,7 +7,7 @@
   const TRAIL_STEPS = 50;
   const DEGREES = 180 / Math.PI;
   const MAP_VELOCITY = 3; // rad/s, the upper edge of the map
-  const MAX_Q = 1 / (1 - RUN.gamma); // the highest possible return
+  const MAX_Q = 1 / (1 - RUN.gamma); // the highest possible return: a reward of 1 at every step
   const VIRIDIS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"]; // as in Matplotlib
   const LAST_EPISODE = RUN.rewards.length - 1;
 
@@ -20,7 +20,7 @@
   let start = 0; // index in RUN.starts
   let state, previous, trail, numSteps;
   let rest = 0; // steps until the next episode starts; 0 during an episode
-  let isPlaying = false;
+  let request = 0; // for the next frame; 0 in a pause
   const push = { direction: 0, isHeld: false, steps: 0 };
 
   // The episode
@@ -71,28 +71,27 @@
   // Time
 
   function play() {
-    if (isPlaying) return;
-    isPlaying = true;
+    if (request !== 0) return;
     show("play", "Pause");
     let last = performance.now(), behind = 0; // ms
     const frame = (now) => {
-      if (!isPlaying) return;
-      behind += Math.min(now - last, 100); // a page that was hidden does not catch up
+      behind += clip(now - last, 0, 100); // a page that was hidden does not catch up
       last = now;
       for (; behind >= 1000 * TAU; behind -= 1000 * TAU) step();
       draw(behind / (1000 * TAU));
-      requestAnimationFrame(frame);
+      request = requestAnimationFrame(frame);
     };
-    requestAnimationFrame(frame);
+    request = requestAnimationFrame(frame);
   }
 
   function pause() {
-    isPlaying = false;
+    cancelAnimationFrame(request);
+    request = 0;
     show("play", "Play");
     draw(1);
   }
 
-  const togglePlay = () => (isPlaying ? pause() : play());
+  const togglePlay = () => (request === 0 ? play() : pause());
 
   // Pushes
 
@@ -113,7 +112,7 @@
     const { episode, epsilon } = RUN.snapshots[(chosen = index)];
     find("#episode").value = episode;
     find("#episode").setAttribute("aria-valuetext", `episode ${episode}`);
-    find("#curve .marker").setAttribute("d", `M${episode} 0V500`);
+    find("#curve .marker").setAttribute("d", `M${episode} 0V${MAX_STEPS}`);
     show("chosen", episode);
     show("reward", RUN.rewards[episode]);
     show("epsilon", `${fixed(100 * epsilon, 0)} %`);
