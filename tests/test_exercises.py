@@ -1,0 +1,156 @@
+import ast
+import re
+
+import pytest
+
+from tests.helpers.notebooks import NOTEBOOKS, render
+
+STUDENTS, SOLUTIONS = render.convert(NOTEBOOKS / "exercises.py").values()
+NUM_EXERCISES = 10
+
+
+def code(notebook, tag=None):
+    return [x.source for x in notebook.cells if x.cell_type == "code" and (tag is None or tag in render.tags(x))]
+
+
+def signatures(cells):
+    """Every function and class of some cells, with its arguments and docstring."""
+    parts = [node for cell in cells for node in ast.walk(ast.parse(cell))]
+    parts = [node for node in parts if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+    return {
+        node.name: (ast.dump(node.args) if isinstance(node, ast.FunctionDef) else None, ast.get_docstring(node))
+        for node in parts
+        if node.name != "__init__"
+    }
+
+
+def test_the_students_version_holds_no_solution_and_no_output():
+    assert not code(STUDENTS, "solution")
+    assert not code(SOLUTIONS, "student")
+    assert all(re.search("# your code here", cell) for cell in code(STUDENTS, "student"))
+    rendered = render.nbformat.read(NOTEBOOKS / "exercises.ipynb", 4)
+    assert not [cell for cell in rendered.cells if cell.get("outputs") or cell.get("execution_count")]
+
+
+def test_both_versions_have_the_same_signatures_and_docstrings():
+    asked, given = signatures(code(STUDENTS, "student")), signatures(code(SOLUTIONS, "solution"))
+    assert len(asked) >= 9
+    assert asked.items() <= given.items()
+
+
+def test_every_exercise_has_a_time_and_a_check():
+    headings = re.findall(r"^## (\d+)\..*\(\d+ minutes\)$", "\n".join(x.source for x in STUDENTS.cells), re.MULTILINE)
+    checks = re.findall(r"^@check\((\d+)\)$", "\n".join(code(STUDENTS, "check")), re.MULTILINE)
+    assert headings == checks == [str(number) for number in range(1, NUM_EXERCISES + 1)]
+
+
+@pytest.fixture(scope="module")
+def machinery():
+    """The names of the cells that the checks need, without any training."""
+    namespace = {}
+    for cell in code(STUDENTS):
+        if "import dqn_keras" in cell or "from dqn_keras import" in cell or "class NotSolvedError" in cell:
+            exec(compile(cell, "cell", "exec"), namespace)
+    return namespace
+
+
+def verdict(machinery, number, answer, capsys):
+    """What the check of one exercise prints about an answer."""
+    (cell,) = (x for x in code(STUDENTS, "check") if f"@check({number})" in x)
+    namespace = dict(machinery)
+    exec(compile(answer, "answer", "exec"), namespace)
+    exec(compile(cell, "check", "exec"), namespace)
+    return capsys.readouterr().out
+
+
+TARGETS = "def my_td_targets(experiences, gamma, q, q_hat):\n    s, a, r, s2, end = experiences\n    return "
+DOUBLE = "def my_double_td_targets(experiences, gamma, q, q_hat):\n    s, a, r, s2, end = experiences\n    return "
+MEMORY = """
+class MyMemory:
+    def __init__(self, size):
+        self.size, self.transitions = size, []
+    def append(self, transition):
+        {append}
+    def sample(self, batch_size, rng):
+        {sample}
+"""
+KEEP = "self.transitions = [*self.transitions, transition][-self.size:]"
+DRAW = "return [self.transitions[i] for i in rng.choice(len(self.transitions), batch_size, replace=False)]"
+WRAPPER = """
+class TimeLimitIsTerminal(gym.Wrapper):
+    def step(self, action):
+        state, reward, terminated, truncated, info = self.env.step(action)
+        return state, reward, {ends}, info
+"""
+PENALTY = """
+class FallCosts(CartPole):
+    def reward(self, state, action, next_state, rng, params=None):
+        {body}
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "answer", "message"),
+    [
+        (1, TARGETS + "None", "not solved yet"),
+        (1, TARGETS + "r + gamma * tf.reduce_max(q_hat(s2), axis=-1)", "the future of a terminal state is worth 0"),
+        (1, TARGETS + "r + (1 - end) * tf.reduce_max(q_hat(s2), axis=-1)", "gamma is missing"),
+        (1, TARGETS + "r + (1 - end) * gamma * tf.reduce_max(q(s2), axis=-1)", "they should come from Q-hat"),
+        (1, TARGETS + "r + (1 - end) * gamma * tf.reduce_mean(q_hat(s2), axis=-1)", "it takes the mean"),
+        (1, TARGETS + "r + (1 - end) * gamma * tf.reduce_max(q_hat(s), axis=-1)", "those of the next states"),
+        (1, TARGETS + "r + end * gamma * tf.reduce_max(q_hat(s2), axis=-1)", "are swapped"),
+        (1, TARGETS + "(r + (1 - end) * gamma * tf.reduce_max(q_hat(s2), axis=-1))[:, None]", "have shape (6, 1)"),
+        (1, TARGETS + "r + (1 - end) * gamma * np.max(q_hat(s2), axis=-1)", "TensorFlow cannot compile it"),
+        (1, TARGETS + "r + 7", "instead of"),
+        (1, TARGETS + "no_such_name", "NameError"),
+        (1, TARGETS + "r + (1 - end) * gamma * tf.reduce_max(q_hat(s2), axis=-1)", "correct"),
+        (3, MEMORY.format(append="pass", sample="pass"), "append stores nothing"),
+        (3, MEMORY.format(append=KEEP, sample="pass"), "sample returns nothing"),
+        (3, MEMORY.format(append="self.transitions.append(transition)", sample=DRAW), "holds 8 transitions"),
+        (3, MEMORY.format(append=KEEP.replace("-self.size:", ":self.size"), sample=DRAW), "the last five are"),
+        (3, MEMORY.format(append=KEEP, sample=DRAW.replace("False", "True")), "draw without replacement"),
+        (3, MEMORY.format(append=KEEP, sample="return self.transitions[-batch_size:]"), "60 % of the batches"),
+        (3, MEMORY.format(append=KEEP, sample=DRAW), "correct"),
+        (4, DOUBLE + "r + (1 - end) * gamma * tf.reduce_max(q_hat(s2), axis=-1)", "Q should choose"),
+        (4, DOUBLE + "r + (1 - end) * gamma * tf.reduce_max(q(s2), axis=-1)", "Q-hat should value it"),
+        (4, DOUBLE + "r + (1 - end) * gamma * tf.gather(q(s2), tf.argmax(q_hat(s2), -1), batch_dims=1)", "swapped"),
+        (4, DOUBLE + "r + (1 - end) * gamma * tf.gather(q_hat(s2), tf.argmax(q(s), -1), batch_dims=1)", "next states"),
+        (4, DOUBLE + "r + (1 - end) * gamma * tf.gather(q_hat(s2), tf.argmax(q(s2), -1), batch_dims=1)", "correct"),
+        (5, WRAPPER.format(ends="terminated, truncated"), "when time is up, terminated must be True"),
+        (5, WRAPPER.format(ends="truncated, False"), "when the pole falls, terminated must be True"),
+        (5, WRAPPER.format(ends="terminated or truncated, truncated"), "truncated must be False"),
+        (5, WRAPPER.format(ends="True, False"), "in the middle of an episode"),
+        (5, WRAPPER.format(ends="terminated or truncated, False"), "correct"),
+        (7, PENALTY.format(body="pass"), "reward returns nothing"),
+        (7, PENALTY.format(body="return tf.where(self.terminal(state, rng), -1.0, 1.0)"), "next_state has fallen"),
+        (
+            7,
+            PENALTY.format(body="return tf.where(self.terminal(next_state, rng), 1.0, -1.0)"),
+            "gives -1.0 instead of 1",
+        ),
+        (7, PENALTY.format(body="return -1.0 if self.terminal(next_state, rng) else 1.0"), "cannot compile"),
+        (7, PENALTY.format(body="return tf.where(self.terminal(next_state, rng), -1.0, 1.0)"), "correct"),
+        (8, "gammas = (0.9, 0.95, 0.99); bounds = None", "bounds is missing"),
+        (8, "gammas = (0.9, 0.95, 0.99); bounds = [10, 20, 99]; weights_of_100 = None", "= 100, not 99"),
+        (8, "gammas = (0.9, 0.95, 0.99); bounds = [10, 20, 100]; weights_of_100 = [90, 95, 99]", "100 times gamma"),
+        (9, "my_config = Config()", "set solved_reward=475"),
+        (9, "my_config = Config(solved_reward=475, solved_window=1)", "may be luck"),
+    ],
+)
+def test_a_check_says_what_is_wrong(machinery, number, answer, message, capsys):
+    said = verdict(machinery, number, answer, capsys)
+    assert said.startswith(f"Exercise {number}: ")
+    assert message in said
+
+
+@pytest.mark.slow
+def test_the_students_version_runs_from_top_to_bottom_unsolved(capsys, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    monkeypatch.chdir(NOTEBOOKS)
+    namespace = {}
+    for cell in code(STUDENTS):
+        exec(compile(cell, "notebook", "exec"), namespace)
+    said = capsys.readouterr().out
+    for number in range(1, NUM_EXERCISES + 1):
+        assert f"Exercise {number}: not solved yet: " in said
+    assert "solved: 0 of 10" in said
