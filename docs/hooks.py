@@ -21,7 +21,7 @@ ALT_TEXTS = {  # of the pictures in the notebooks, by the tag of their cell
     "save-catch_run": "A run at a glance: rewards, Q-values under their bound, TD error, terminal share",
     "save-catch": "The moving picture of an episode: the paddle catches ball after ball",
     "picture-table": "The lake after 0 to 1,000 episodes: values spread from the goal to the start, arrows lead there",
-    "picture-wrong_states": "Highest Q-value against measured return of 300 states: many are far from the diagonal",
+    "picture-wrong_states": "What Q says against what is measured: closer for states met in training than at random",
     "save-one_collapse": "One seed that got stuck: reward, greedy return, highest Q, share of terminal transitions",
 }
 
@@ -53,8 +53,8 @@ def notebook_blocks(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
                 heading = line
             continue
         code = fence(cell.source, "python")
-        is_check = "check" in cell.metadata.get("tags", [])
-        yield f'<details markdown="1"><summary>The check</summary>\n\n{code}\n\n</details>' if is_check else code
+        is_folded = "folded" in cell.metadata.get("tags", [])
+        yield f'<details markdown="1"><summary>Show the code</summary>\n\n{code}\n\n</details>' if is_folded else code
         for output in cell.outputs:
             data = output.get("data", {})
             if "image/png" in data:

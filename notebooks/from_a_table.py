@@ -183,10 +183,17 @@ def update(q_network, optimizer, s, a, y):
 # %% [markdown]
 # Both learn from the same 500 steps, one after the other: random actions in random cells.
 
+
 # %%
-linear = keras.Sequential([keras.Input((16,)), keras.layers.Dense(4, use_bias=False, kernel_initializer="zeros")])
-sgd = keras.optimizers.SGD(alpha / 2)
-sgd.build(linear.trainable_variables)
+def new_linear_network():
+    """Returns a network that is a table of zeros, and an optimizer for it."""
+    layer = keras.layers.Dense(4, use_bias=False, kernel_initializer="zeros")
+    network, optimizer = keras.Sequential([keras.Input((16,)), layer]), keras.optimizers.SGD(alpha / 2)
+    optimizer.build(network.trainable_variables)
+    return network, optimizer
+
+
+linear, sgd = new_linear_network()
 table, rng = np.zeros((16, 4), np.float32), np.random.default_rng(0)
 for _ in range(500):
     s, a = rng.integers(16), rng.integers(4)
@@ -204,7 +211,7 @@ np.testing.assert_array_equal(kernel, table)
 #
 # ## A hidden layer
 #
-# A table for CartPole would have a row for each state, and a state there is four real numbers: no state ever comes
+# A table for CartPole would have a row for each state, and a state there is four real numbers: hardly one ever comes
 # back. A network with a hidden layer can tell something about states that it has never seen, because **states share
 # weights**. The price: an update of one state changes others. The same step ten times, from cell 14 to the goal:
 
@@ -225,24 +232,28 @@ for name, network, optimizer in (("no hidden layer", linear, sgd), ("a hidden la
         update(network, optimizer, s=14, a=2, y=1.0)
     change = network(cells).numpy() - before
     others = np.delete(change.ravel(), 4 * 14 + 2)
-    print(f"{name}: Q(14, right) changes by {change[14, 2]:+.3f}, and with it {np.sum(others != 0)} of the other")
-    print(f"                 63 numbers, the most by {np.abs(others).max():.3f}")
+    print(f"{name}: Q(14, right) changes by {change[14, 2]:+.3f};", end=" ")
+    print(f"{np.sum(others != 0)} of the other 63 numbers change, at most by {np.abs(others).max():.3f}")
 
 # %% [markdown]
 # Two difficulties follow, which a table does not have.
 #
-# **The order matters.** We take the right answers for all 64 numbers, each 100 times, and teach them to two new
-# networks: once cell after cell, as an agent meets them on its way, and once shuffled.
+# **The order matters.** We take the right answers for all 64 numbers, each 50 times, and teach them to new networks:
+# cell after cell, as to an agent that stays for long in one part of the lake; and the same ones shuffled.
 
 # %%
 right = np.zeros((16, 4), np.float32)
 for s, a in np.ndindex(16, 4):
     [(_, next_s, r, terminated)] = env.unwrapped.P[s][a]
     right[s, a] = r + (1 - terminated) * gamma * q[next_s].max()
-in_order = [(s, a) for s in range(16) for _ in range(100) for a in range(4)]
+in_order = [(s, a) for s in range(16) for _ in range(50) for a in range(4)]
 shuffled = np.random.default_rng(0).permutation(in_order).tolist()
-for name, pairs in (("cell after cell", in_order), ("shuffled       ", shuffled)):
-    network, optimizer = new_network()
+for name, make, pairs in (
+    ("no hidden layer, cell after cell", new_linear_network, in_order),
+    ("a hidden layer, cell after cell ", new_network, in_order),
+    ("a hidden layer, shuffled        ", new_network, shuffled),
+):
+    network, optimizer = make()
     for s, a in pairs:
         update(network, optimizer, s, a, right[s, a])
     error = np.abs(network(cells).numpy() - right).mean(axis=1)
@@ -283,4 +294,4 @@ show_targets("a hidden layer and Q-hat", other, frozen, 0.1)
 #
 # So much for what is new with a network. The two ideas that DQN adds to Q-learning answer just this: a **replay
 # memory**, from which the steps are drawn in random order, and a **target network**, the copy. The lesson,
-# [deep_q_network.ipynb](deep_q_network.ipynb), builds both, for a task in which no table is possible.
+# [deep_q_network.ipynb](deep_q_network.ipynb), builds both, for a task with too many states for a table.

@@ -42,7 +42,7 @@ def without(source: Path, tag: str) -> nbformat.NotebookNode:
     notebook.cells = [cell for cell in notebook.cells if tag not in tags(cell)]
     for number, cell in enumerate(notebook.cells, start=1):
         cell.id = f"cell-{number:02}"
-        if "check" in tags(cell):
+        if "folded" in tags(cell):
             cell.metadata["jupyter"] = {"source_hidden": True}  # JupyterLab folds it
     notebook.metadata = {
         "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},

@@ -40,7 +40,7 @@ def test_both_versions_have_the_same_signatures_and_docstrings():
 
 def test_every_exercise_has_a_time_and_a_check():
     headings = re.findall(r"^## (\d+)\..*\(\d+ minutes\)$", "\n".join(x.source for x in STUDENTS.cells), re.MULTILINE)
-    checks = re.findall(r"^@check\((\d+)\)$", "\n".join(code(STUDENTS, "check")), re.MULTILINE)
+    checks = re.findall(r"^@check\((\d+)\)$", "\n".join(code(STUDENTS, "folded")), re.MULTILINE)
     assert headings == checks == [str(number) for number in range(1, NUM_EXERCISES + 1)]
 
 
@@ -56,7 +56,7 @@ def machinery():
 
 def verdict(machinery, number, answer, capsys):
     """What the check of one exercise prints about an answer."""
-    (cell,) = (x for x in code(STUDENTS, "check") if f"@check({number})" in x)
+    (cell,) = (x for x in code(STUDENTS, "folded") if f"@check({number})" in x)
     namespace = dict(machinery)
     exec(compile(answer, "answer", "exec"), namespace)
     exec(compile(cell, "check", "exec"), namespace)
@@ -103,24 +103,24 @@ class FallCosts(CartPole):
         (1, TARGETS + "r + (1 - end) * gamma * np.max(q_hat(s2), axis=-1)", "TensorFlow cannot compile it"),
         (1, TARGETS + "r + 7", "instead of"),
         (1, TARGETS + "no_such_name", "NameError"),
-        (1, TARGETS + "r + (1 - end) * gamma * tf.reduce_max(q_hat(s2), axis=-1)", "correct"),
+        (1, TARGETS + "r + (1 - end) * gamma * tf.reduce_max(q_hat(s2), axis=-1)", ": solved."),
         (3, MEMORY.format(append="pass", sample="pass"), "append stores nothing"),
         (3, MEMORY.format(append=KEEP, sample="pass"), "sample returns nothing"),
         (3, MEMORY.format(append="self.transitions.append(transition)", sample=DRAW), "holds 8 transitions"),
         (3, MEMORY.format(append=KEEP.replace("-self.size:", ":self.size"), sample=DRAW), "the last five are"),
         (3, MEMORY.format(append=KEEP, sample=DRAW.replace("False", "True")), "draw without replacement"),
         (3, MEMORY.format(append=KEEP, sample="return self.transitions[-batch_size:]"), "60 % of the batches"),
-        (3, MEMORY.format(append=KEEP, sample=DRAW), "correct"),
+        (3, MEMORY.format(append=KEEP, sample=DRAW), ": solved."),
         (4, DOUBLE + "r + (1 - end) * gamma * tf.reduce_max(q_hat(s2), axis=-1)", "Q should choose"),
         (4, DOUBLE + "r + (1 - end) * gamma * tf.reduce_max(q(s2), axis=-1)", "Q-hat should value it"),
         (4, DOUBLE + "r + (1 - end) * gamma * tf.gather(q(s2), tf.argmax(q_hat(s2), -1), batch_dims=1)", "swapped"),
         (4, DOUBLE + "r + (1 - end) * gamma * tf.gather(q_hat(s2), tf.argmax(q(s), -1), batch_dims=1)", "next states"),
-        (4, DOUBLE + "r + (1 - end) * gamma * tf.gather(q_hat(s2), tf.argmax(q(s2), -1), batch_dims=1)", "correct"),
+        (4, DOUBLE + "r + (1 - end) * gamma * tf.gather(q_hat(s2), tf.argmax(q(s2), -1), batch_dims=1)", ": solved."),
         (5, WRAPPER.format(ends="terminated, truncated"), "when time is up, terminated must be True"),
         (5, WRAPPER.format(ends="truncated, False"), "when the pole falls, terminated must be True"),
         (5, WRAPPER.format(ends="terminated or truncated, truncated"), "truncated must be False"),
         (5, WRAPPER.format(ends="True, False"), "in the middle of an episode"),
-        (5, WRAPPER.format(ends="terminated or truncated, False"), "correct"),
+        (5, WRAPPER.format(ends="terminated or truncated, False"), ": solved."),
         (7, PENALTY.format(body="pass"), "reward returns nothing"),
         (7, PENALTY.format(body="return tf.where(self.terminal(state, rng), -1.0, 1.0)"), "next_state has fallen"),
         (
@@ -129,7 +129,7 @@ class FallCosts(CartPole):
             "gives -1.0 instead of 1",
         ),
         (7, PENALTY.format(body="return -1.0 if self.terminal(next_state, rng) else 1.0"), "cannot compile"),
-        (7, PENALTY.format(body="return tf.where(self.terminal(next_state, rng), -1.0, 1.0)"), "correct"),
+        (7, PENALTY.format(body="return tf.where(self.terminal(next_state, rng), -1.0, 1.0)"), ": solved."),
         (8, "gammas = (0.9, 0.95, 0.99); bounds = None", "bounds is missing"),
         (8, "gammas = (0.9, 0.95, 0.99); bounds = [10, 20, 99]; weights_of_100 = None", "= 100, not 99"),
         (8, "gammas = (0.9, 0.95, 0.99); bounds = [10, 20, 100]; weights_of_100 = [90, 95, 99]", "100 times gamma"),
