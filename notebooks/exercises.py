@@ -248,9 +248,12 @@ prediction = None  # your code here: "more", "as many" or "fewer"
 prediction = "more"
 
 # %% [markdown]
-# Now measure: a `sweep` with both settings and the seeds `range(100)`. It has the form `sweep(CartPole(), {"one name":
-# Config(...), "another": Config(...)}, seeds=range(100), verbose=0)`. Call the settings `"tau 0.01"` and `"tau 1"`. It
-# takes about a minute, less on more cores.
+# Now measure: a `sweep` with both settings, called `"tau 0.01"` and `"tau 1"`, and the seeds `range(100)`. It is the
+# longest computation of this notebook. Its form is
+#
+# ```python
+# sweep(CartPole(), {"one name": Config(...), "another": Config(...)}, seeds=range(100), verbose=0)
+# ```
 
 # %% tags=["student"]
 by_tau = None  # your code here
@@ -266,7 +269,7 @@ def _():
     predicted = answer(prediction, "write your prediction first")
     assert predicted in words, f"prediction must be one of {words}, and is {predicted!r}"
     found = answer(by_tau, "by_tau is missing, the result of sweep")
-    assert {"tau 0.01", "tau 1"} == set(found), f"the settings are called {sorted(found)}"
+    assert {"tau 0.01", "tau 1"} == set(found), f'the settings are {sorted(found)}; call them "tau 0.01" and "tau 1"'
     slow, none = found["tau 0.01"], found["tau 1"]
     assert slow.config.tau == 0.01, f'"tau 0.01" was trained with tau={slow.config.tau}'
     assert none.config.tau == 1, f'"tau 1" was trained with tau={none.config.tau}'
@@ -400,9 +403,9 @@ for correlation in (0.0, 0.5, 1.0):
     print(f"correlation {correlation}: maximum {first.max(axis=1).mean():.2f}, valued by the second {of_second:.2f}")
 
 # %% [markdown]
-# The maximum says 1.16 where 0 is right. If one set of values *chooses* the action and an independent one *values* it,
-# the error is gone; the more alike the two are, the more of it stays. Double DQN uses this: $Q$ chooses, $\hat Q$
-# values.
+# The maximum says more than 1 where 0 is right. If one set of values *chooses* the action and an independent one
+# *values* it, the error is gone; the more alike the two are, the more of it stays. Double DQN uses this: $Q$ chooses,
+# $\hat Q$ values.
 #
 # $$y = r + (1 - \text{terminal}) \, \gamma \, \hat Q\bigl(s', \arg\max_{a'} Q(s', a')\bigr)$$
 #
@@ -601,9 +604,9 @@ if 6 in solved:
     plt.show()
 
 # %% [markdown] tags=["solution"]
-# **What it shows.** Q is no table of truths. It is roughly right for states like those that it was trained on, and it
-# can be far off elsewhere, even below 0, which no sum of rewards of 1 can be. It acts well as long as it stays where
-# it knows its way.
+# **What it shows.** Q is closer to the measurement in states like those that it was trained on. Elsewhere it may be
+# far off, even below 0, which no sum of rewards of 1 can be. And among the states of training it is wrong where the
+# end is near: it promises a lot where one or two steps are left.
 
 # %% [markdown]
 # ## 7. A fall that costs (20 minutes)
@@ -727,9 +730,9 @@ if 8 in solved:
         print(f"gamma {gamma}: {np.mean(lengths):.0f} steps; ends: {counts}; cart in the end {np.mean(sides):.2f} off")
 
 # %% [markdown] tags=["solution"]
-# **What it shows.** With $\gamma = 0.9$ the pole does not fall; the cart moves aside until it leaves the track,
-# slowly, after some hundred steps. The edge is farther away than the agent looks. With a larger $\gamma$, fewer
-# episodes end at the edge, and they last longer. Only $\gamma$ was changed, so it is a cause of both.
+# **What it shows.** With $\gamma = 0.9$ the pole does not fall; the cart moves aside until it leaves the track, after
+# some hundred steps. With a larger $\gamma$, fewer episodes end at the edge, and they last longer. Only $\gamma$ was
+# changed, so it is a cause of both.
 
 # %% [markdown]
 # ## 9. Solve it properly (30 minutes)
@@ -893,7 +896,7 @@ for name, parts in agents.items():
     print("   the first to fail:", next(f"{probe}: {what}" for probe, what in found.items() if what))
 
 # %% [markdown]
-# Now read the five parts, and repair them: write each function again, without its mistake.
+# Now unfold the cell, read the five parts and repair them: write each function again, without its mistake.
 
 # %% tags=["student"]
 repaired = {

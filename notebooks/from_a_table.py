@@ -72,7 +72,7 @@ def q_learning(env, num_episodes, seed=0, alpha=alpha):
 # higher, and an arrow for the action that has it (none while all four are equal).
 
 
-# %%
+# %% tags=["folded"]
 def draw(ax, q, title):
     """Draws a table [16, 4] on the lake: the highest value of each cell, and the action that has it."""
     values = q.max(axis=1).reshape(4, 4)
@@ -104,9 +104,9 @@ plt.show()
 print("the goal is reached for the first time in episode", next(n for n, q in enumerate(tables) if q.any()))
 
 # %% [markdown]
-# The values appear at the goal first and spread backwards, since a cell can only learn from the cells that follow it.
-# In the end they say how far the goal is: a cell from which it is reached in $k$ steps has the value $\gamma^{k-1}$.
-# The start needs six steps, and has
+# For a long time there is nothing to learn from: the agent finds the goal by chance alone. Then the values spread from
+# the goal backwards, since a cell can only learn from the cells that follow it. In the end they say how far the goal
+# is: a cell from which it is reached in $k$ steps has the value $\gamma^{k-1}$. The start needs six steps, and has
 
 # %%
 q = tables[-1]

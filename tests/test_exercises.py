@@ -49,7 +49,7 @@ def machinery():
     """The names of the cells that the checks need, without any training."""
     namespace = {}
     for cell in code(STUDENTS):
-        if "import dqn_keras" in cell or "from dqn_keras import" in cell or "class NotSolvedError" in cell:
+        if any(part in cell for part in ("from dqn_keras import", "class NotSolvedError", "def q_function")):
             exec(compile(cell, "cell", "exec"), namespace)
     return namespace
 
@@ -82,6 +82,13 @@ class TimeLimitIsTerminal(gym.Wrapper):
         state, reward, terminated, truncated, info = self.env.step(action)
         return state, reward, {ends}, info
 """
+SWEEP = "from dqn_keras import Study, Sweep\nprediction = 'more'\nby_tau = Sweep({{{}}})"
+SUM = """from types import SimpleNamespace
+run = SimpleNamespace(q_network=make_q_network(4, 2, seed=0), config=Config())
+wrong_state = {}
+def discounted_return(rewards, gamma):
+    return """
+RIGHT_SUM = "sum(gamma**k * reward for k, reward in enumerate(rewards))"
 PENALTY = """
 class FallCosts(CartPole):
     def reward(self, state, action, next_state, rng, params=None):
@@ -104,6 +111,13 @@ class FallCosts(CartPole):
         (1, TARGETS + "r + 7", "instead of"),
         (1, TARGETS + "no_such_name", "NameError"),
         (1, TARGETS + "r + (1 - end) * gamma * tf.reduce_max(q_hat(s2), axis=-1)", ": solved."),
+        (2, "prediction = by_tau = None", "write your prediction first"),
+        (2, "prediction, by_tau = 'yes', None", "must be one of"),
+        (2, "prediction, by_tau = 'fewer', None", "by_tau is missing"),
+        (2, SWEEP.format("'a': Study(Config(), [])"), "call them"),
+        (2, SWEEP.format("'tau 0.01': Study(Config(), []), 'tau 1': Study(Config(), [])"), "trained with tau=0.01"),
+        (2, SWEEP.format("'tau 0.01': Study(Config(), []), 'tau 1': Study(Config(tau=1, gamma=0.9), [])"), "more than"),
+        (2, SWEEP.format("'tau 0.01': Study(Config(), []), 'tau 1': Study(Config(tau=1), [])"), "too few"),
         (3, MEMORY.format(append="pass", sample="pass"), "append stores nothing"),
         (3, MEMORY.format(append=KEEP, sample="pass"), "sample returns nothing"),
         (3, MEMORY.format(append="self.transitions.append(transition)", sample=DRAW), "holds 8 transitions"),
@@ -121,6 +135,14 @@ class FallCosts(CartPole):
         (5, WRAPPER.format(ends="terminated or truncated, truncated"), "truncated must be False"),
         (5, WRAPPER.format(ends="True, False"), "in the middle of an episode"),
         (5, WRAPPER.format(ends="terminated or truncated, False"), ": solved."),
+        (6, SUM.format(None) + "None", "discounted_return returns nothing"),
+        (6, SUM.format(None) + "sum(rewards)", "gamma is missing"),
+        (6, SUM.format(None) + "gamma * " + RIGHT_SUM, "the first reward is discounted, too"),
+        (6, SUM.format(None) + RIGHT_SUM, "wrong_state is missing"),
+        (6, SUM.format([0, 0, 0]) + RIGHT_SUM, "a state is four numbers"),
+        (6, SUM.format([2.5, 0, 0, 0]) + RIGHT_SUM, "the episode is over"),
+        (6, SUM.format([0, 0, 0, 9]) + RIGHT_SUM, "stay within"),
+        (6, SUM.format([0, 0, 0, 0]) + RIGHT_SUM, ": solved."),
         (7, PENALTY.format(body="pass"), "reward returns nothing"),
         (7, PENALTY.format(body="return tf.where(self.terminal(state, rng), -1.0, 1.0)"), "next_state has fallen"),
         (
@@ -141,6 +163,26 @@ def test_a_check_says_what_is_wrong(machinery, number, answer, message, capsys):
     said = verdict(machinery, number, answer, capsys)
     assert said.startswith(f"Exercise {number}: ")
     assert message in said
+
+
+@pytest.mark.slow
+def test_the_check_of_the_probes_names_agent_and_probe(machinery, capsys):
+    namespace = dict(machinery)
+    for cell in code(STUDENTS):
+        if any(part in cell for part in ("class Probe", "def run_probe", "def targets_a")):
+            exec(compile(cell, "cell", "exec"), namespace)
+    assert "'passes', 'passes', 'passes', 'passes', 'passes'" in capsys.readouterr().out
+    none = dict.fromkeys("ABCDE")
+    assert "A, B, C, D, E not repaired" in verdict(namespace, 10, f"repaired = {none}", capsys)
+    for name, part, probe in (
+        ("A", "targets_a", 5),
+        ("B", "targets_b", 1),
+        ("C", "choose_c", 4),
+        ("D", "remember_d", 2),
+    ):
+        said = verdict(namespace, 10, f"repaired = {none}\nrepaired['{name}'] = {part}", capsys)
+        assert f"not right yet: {name} fails in probe {probe}: " in said
+    assert "A, B, C, D not repaired" in verdict(namespace, 10, f"repaired = {none}\nrepaired['E'] = td_targets", capsys)
 
 
 @pytest.mark.slow
