@@ -118,6 +118,11 @@ class FallCosts(CartPole):
         (2, SWEEP.format("'tau 0.01': Study(Config(), []), 'tau 1': Study(Config(), [])"), "trained with tau=0.01"),
         (2, SWEEP.format("'tau 0.01': Study(Config(), []), 'tau 1': Study(Config(tau=1, gamma=0.9), [])"), "more than"),
         (2, SWEEP.format("'tau 0.01': Study(Config(), []), 'tau 1': Study(Config(tau=1), [])"), "too few"),
+        (
+            2,
+            SWEEP.format("'tau 0.01': Study(Config(num_episodes=9), []), 'tau 1': Study(Config(), [])"),
+            "9 episodes do",
+        ),
         (3, MEMORY.format(append="pass", sample="pass"), "append stores nothing"),
         (3, MEMORY.format(append=KEEP, sample="pass"), "sample returns nothing"),
         (3, MEMORY.format(append="self.transitions.append(transition)", sample=DRAW), "holds 8 transitions"),
