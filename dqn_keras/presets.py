@@ -11,8 +11,10 @@ presets: dict[str, Config] = {
         solved_window=100,
     ),
     "Acrobot-v1": Config(
+        alpha=0.0015,
         gamma=0.99,
-        decay=0.97,
+        tau=0.05,
+        decay=0.93,
         epsilon_min=0.01,
         hidden_units=(128,),
         solved_reward=-100,
