@@ -1,4 +1,4 @@
-"""The search that found the presets of Acrobot and MountainCar, with Optuna.
+"""Searches for settings that solve Acrobot or MountainCar, with Optuna.
 
     python -m benchmarks.tune Acrobot-v1 --trials 40
     python -m benchmarks.tune MountainCar-v0 --trials 40
