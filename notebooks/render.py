@@ -42,7 +42,7 @@ def render(source: Path) -> Path:
     notebook = convert(source)
     metadata = copy.deepcopy(notebook.metadata)
     NotebookClient(
-        notebook, timeout=300, record_timing=False, coalesce_streams=True, resources={"metadata": {"path": NOTEBOOKS}}
+        notebook, timeout=1200, record_timing=False, coalesce_streams=True, resources={"metadata": {"path": NOTEBOOKS}}
     ).execute()
     notebook.metadata = metadata  # without the versions that the run has put in
     for cell in notebook.cells:
