@@ -2,7 +2,8 @@
 
 `make docs` runs it after the build. A page is wrong if it logs an error, asks another host for anything, has a picture
 that does not show or has no alt text, a link within the site that leads nowhere, or a formula left as LaTeX. The moving
-picture has to move, and the search to find.
+picture has to move, and the page "Watch it learn" to play. The search has to find, also when the site is opened from
+the disk.
 """
 
 import functools
@@ -14,10 +15,11 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import unquote, urldefrag, urlsplit
 
-from playwright.sync_api import Browser, Page, Request, sync_playwright
+from playwright.sync_api import Browser, Page, Request, TimeoutError, sync_playwright
 
 SITE = Path(__file__).parent.parent / "site"
 NAMES = ("chromium", "chromium-browser", "google-chrome")
+QUIET = ["--disable-quic", "--disable-sync"]  # beside Playwright's own: the browser itself asks no other host
 
 LOOK = r"""async () => {
     const images = [...document.images];
@@ -63,8 +65,11 @@ def check(browser: Browser, host: str) -> int:
                 wrong[name].append(f"{problem}: {link}")
     if not moving:
         wrong["index.html"].append("no page has a moving picture")
-    if not finds(page, host, "ReplayMemory"):
-        wrong["index.html"].append("the search does not find ReplayMemory")
+    for where in (host, SITE.as_uri()):
+        if not finds(page, where, "ReplayMemory"):
+            wrong["index.html"].append(f"the search does not find ReplayMemory on pages of {where}")
+    if not plays(page, host):
+        wrong["watch_it_learn.html"].append("the pole does not move by itself")
 
     for name in names:
         counts = {key: len(seen[name][key]) for key in ("images", "links")} | {"formulas": seen[name]["formulas"]}
@@ -138,22 +143,39 @@ def moves(page: Page, src: str) -> bool:
 def finds(page: Page, host: str, word: str) -> bool:
     """Whether the search, which runs in the browser, has results for a word."""
     page.goto(f"{host}/index.html")
-    page.locator("input.md-search__input").fill(word)
-    results = page.locator("a.md-search-result__link")
-    results.first.wait_for(state="attached")
-    return results.count() > 0
+    try:
+        page.locator("input.md-search__input").fill(word)
+        page.locator("a.md-search-result__link").first.wait_for(state="attached")
+    except TimeoutError:
+        return False
+    return True
+
+
+def plays(page: Page, host: str) -> bool:
+    """Whether the page "Watch it learn" starts, and counts its steps."""
+    page.goto(f"{host}/watch_it_learn.html")
+    try:
+        page.wait_for_function("parseInt(document.querySelector('#step').textContent) > 5")
+    except TimeoutError:
+        return False
+    return True
+
+
+def find_chromium() -> str | None:
+    """The path of a Chromium, if there is one."""
+    return next(filter(None, map(shutil.which, NAMES)), None)
 
 
 def main() -> int:
     """The exit status: 0 if all is well, or if there is no browser and none is required."""
-    chromium = next(filter(None, map(shutil.which, NAMES)), None)
+    chromium = find_chromium()
     if chromium is None:
         print("The pages are built, but not looked at: there is no Chromium (apt-get install chromium).")
         return int(os.environ.get("REQUIRE_BROWSER") == "1")
     server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=SITE))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium)
+        browser = playwright.chromium.launch(executable_path=chromium, args=QUIET)
         num_wrong = check(browser, f"http://127.0.0.1:{server.server_port}")
         browser.close()
     server.shutdown()

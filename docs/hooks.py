@@ -20,6 +20,9 @@ ALT_TEXTS = {  # of the pictures in the notebooks, by the tag of their cell
     "save-slow_target": "Share not solved by episode 500, median episodes and greedy return for four values of tau",
     "save-catch_run": "A run at a glance: rewards, Q-values under their bound, TD error, terminal share",
     "save-catch": "The moving picture of an episode: the paddle catches ball after ball",
+    "picture-table": "The lake after 0 to 1,000 episodes: values spread from the goal to the start, arrows lead there",
+    "picture-wrong_states": "What Q says against what is measured: closer for states met in training than at random",
+    "save-does_it_need_this": "Share not solved by episode 500, median episodes and greedy return for nine settings",
     "save-one_collapse": "One seed that got stuck: reward, greedy return, highest Q, share of terminal transitions",
 }
 
@@ -40,16 +43,19 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def notebook_blocks(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
     """A notebook with its committed outputs as Markdown; nothing is executed. `pictures` is filled by file name."""
-    heading = ""
-    for cell in nbformat.read(path, as_version=4).cells:
+    heading, cells = "", nbformat.read(path, as_version=4).cells
+    kind = "A notebook, with its outputs" if any(cell.get("outputs") for cell in cells) else "A notebook to work in"
+    for cell in cells:
         if cell.cell_type == "markdown":
-            yield cell.source
+            yield re.sub(r"\((\w+)\.ipynb", r"(\1.md", cell.source)  # links lead from page to page
             for line in re.findall(r"^#+ (.*)", cell.source, re.MULTILINE):
                 if not heading:
-                    yield f"*A notebook, with its outputs: [{path.name}]({path.name}).*{{ .source }}"
+                    yield f"*{kind}: [{path.name}]({path.name}).*{{ .source }}"
                 heading = line
             continue
-        yield fence(cell.source, "python")
+        code = fence(cell.source, "python")
+        is_folded = "folded" in cell.metadata.get("tags", [])
+        yield f'<details markdown="1"><summary>Show the code</summary>\n\n{code}\n\n</details>' if is_folded else code
         for output in cell.outputs:
             data = output.get("data", {})
             if "image/png" in data:

@@ -59,8 +59,8 @@ for seed, episode in zip(outcome.seeds[late], outcome.solved_at[late], strict=Tr
 # %% [markdown]
 # ## A seed that went wrong
 #
-# The slowest of them again, watched. One seed gives one run, so the agent goes the very same way while `Evaluation`
-# lets it play greedily now and then.
+# Let us train the slowest of them again and watch it. One seed gives one run, so this is exactly the run from above;
+# `Evaluation` only lets the agent play greedily now and then.
 
 # %%
 worst = int(np.argmax(outcome.episodes_to_solved))
@@ -202,7 +202,7 @@ _, ax = plt.subplots(figsize=(8, 3), layout="constrained")
 ax.hist(greedy, bins=np.arange(100, 501, 20), color="tab:green", alpha=0.7)
 ax.axvline(np.median(training), color="gray", linestyle=":", label="training, last 50 episodes (median)")
 ax.set(xlabel="Mean return of 100 greedy episodes", ylabel="Seeds")
-_ = ax.legend()
+_ = ax.legend(loc="upper left")
 
 # %% [markdown]
 # Usually, then, and not always. The stop rule ends training at the first moment at which the mean of 50 episodes is

@@ -1,0 +1,297 @@
+# %% [markdown]
+# # From a table to a network
+#
+# A DQN is Q-learning with a network where there used to be a table. This notebook begins with the table, which one can
+# see filling. Then it makes the same step with a network, and gets the same numbers. Then it gives the network a
+# hidden layer, and something new happens. It takes about ten minutes to read; you need no more than Python and NumPy.
+
+# %%
+import os
+
+os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # otherwise TensorFlow logs into the notebook
+
+import gymnasium as gym
+import matplotlib.pyplot as plt
+import numpy as np
+
+from dqn_keras import make_q_network, td_targets
+
+import keras  # isort: skip  (after dqn_keras, which keeps TensorFlow from logging)
+
+# %% [markdown]
+# ## A lake
+#
+# [FrozenLake](https://gymnasium.farama.org/environments/toy_text/frozen_lake/): a field of 4 × 4 cells. **S** is the
+# start, **G** the goal, **H** a hole. In each *state* (a cell, 0 to 15) there are four *actions*: left (0), down (1),
+# right (2), up (3). A step to the goal gives a *reward* of 1, every other step 0. Goal and holes are *terminal*: the
+# *episode* is over. After 100 steps time is up.
+
+# %%
+env = gym.make("FrozenLake-v1", is_slippery=False)  # a step goes where it is meant to go
+field = env.unwrapped.desc.astype(str)  # [4, 4] letters
+print("\n".join(" ".join(row) for row in field))
+
+# %% [markdown]
+# ## The table
+#
+# $Q(s, a)$ is what one can expect after action $a$ in state $s$: the sum of all later rewards, where a reward counts
+# less the later it comes, by a factor $\gamma$ for each step. There are 16 states and 4 actions, so all of $Q$ is a
+# table of 64 numbers. At the beginning all are 0.
+#
+# Each step $(s, a, r, s')$ gives a better guess of one of them: the reward, plus what the table says about the state
+# that follows. If $s'$ is terminal, nothing follows.
+#
+# $$y = r + \gamma \max_{a'} Q(s', a') \qquad\qquad Q(s, a) \leftarrow Q(s, a) + \alpha \, \bigl(y - Q(s, a)\bigr)$$
+#
+# $y$ is the *target*; $\alpha$ says how far the old number moves towards it. To see all actions, the agent takes a
+# random one with probability $\varepsilon$; otherwise the one with the highest number. That is all of **Q-learning**
+# ([Watkins and Dayan 1992](https://link.springer.com/article/10.1007/BF00992698)):
+
+# %%
+gamma, alpha, epsilon = 0.9, 0.5, 0.5
+
+
+def q_learning(env, num_episodes, seed=0, alpha=alpha):
+    """Fills a table [16, 4]; yields it at the start and after each episode."""
+    q, rng = np.zeros((16, 4)), np.random.default_rng(seed)
+    yield q
+    for episode in range(num_episodes):
+        (s, _), is_over = env.reset(seed=seed if episode == 0 else None), False
+        while not is_over:
+            best = rng.choice(np.flatnonzero(q[s] == q[s].max()))  # of equal ones, any
+            a = int(rng.integers(4)) if rng.random() < epsilon else int(best)
+            next_s, r, terminated, truncated, _ = env.step(a)
+            y = r + (1 - terminated) * gamma * q[next_s].max()
+            q[s, a] += alpha * (y - q[s, a])
+            s, is_over = next_s, terminated or truncated
+        yield q
+
+
+# %% [markdown]
+# Here is the table after 0, 120, 240, 260 and 1,000 episodes. Each cell shows its highest Q-value, darker if it is
+# higher, and an arrow for the action that has it (none while all four are equal).
+
+
+# %% tags=["folded"]
+def draw(ax, q, title):
+    """Draws a table [16, 4] on the lake: the highest value of each cell, and the action that has it."""
+    values = q.max(axis=1).reshape(4, 4)
+    ax.imshow(values, cmap="Greys", vmin=0, vmax=1.6)  # at most middle grey, so that black text is readable
+    for (row, column), letter in np.ndenumerate(field):
+        if letter in "HG":
+            ax.text(column, row, {"H": "hole", "G": "goal"}[letter], ha="center", va="center", style="italic")
+            continue
+        of_cell = q[4 * row + column]
+        ax.text(column, row + 0.28, f"{of_cell.max():.2f}", ha="center", va="center", fontsize=9)
+        if of_cell.max() > of_cell.min():
+            x, y = [(-1, 0), (0, 1), (1, 0), (0, -1)][of_cell.argmax()]
+            ax.annotate(
+                "", (column + 0.22 * x, row - 0.14 + 0.22 * y), (column - 0.22 * x, row - 0.14 - 0.22 * y),
+                arrowprops={"arrowstyle": "->", "lw": 1.6},
+            )  # fmt: skip
+    ax.set(xticks=np.arange(-0.5, 4), yticks=np.arange(-0.5, 4), xticklabels=[], yticklabels=[], title=title)
+    ax.tick_params(length=0)
+    ax.grid(color="black", linewidth=0.6)
+
+
+# %% tags=["picture-table"]
+shown = (0, 120, 240, 260, 1_000)
+tables = [q.copy() for q in q_learning(env, 1_000)]
+figure, axes = plt.subplots(1, 5, figsize=(15, 3.3), layout="constrained")
+for ax, n in zip(axes, shown, strict=True):
+    draw(ax, tables[n], f"after {n:,} episodes")
+plt.show()
+print("the goal is reached for the first time in episode", next(n for n, q in enumerate(tables) if q.any()))
+
+# %% [markdown]
+# For a long time there is nothing to learn from: the agent finds the goal by chance alone. Then the values spread from
+# the goal backwards, since a cell can only learn from the cells that follow it. In the end they say how far the goal
+# is: a cell from which it is reached in $k$ steps has the value $\gamma^{k-1}$. The start needs six steps, and has
+
+# %%
+q = tables[-1]
+print(f"{q[0].max():.4f}, and 0.9^5 = {0.9**5:.4f}")
+assert np.isclose(q[0].max(), 0.9**5)
+
+# %% [markdown]
+# *A remark.* Usually the ice is slippery: a step goes where it is meant to go in one of three cases, and sideways
+# otherwise. So the same action gives another target each time. How often does the table reach the goal, if it always
+# takes its best action? Two values of $\alpha$, three seeds each:
+
+
+# %%
+def share_of_goals(env, q, num_episodes=500, seed=1):
+    """Returns how often the goal is reached by the best actions of a table."""
+    goals = 0.0
+    for episode in range(num_episodes):
+        (s, _), is_over = env.reset(seed=seed if episode == 0 else None), False
+        while not is_over:
+            s, r, terminated, truncated, _ = env.step(int(q[s].argmax()))
+            goals, is_over = goals + r, terminated or truncated
+    return goals / num_episodes
+
+
+slippery = gym.make("FrozenLake-v1", is_slippery=True)
+for name, lake, step in (("firm ice", env, 0.5), ("slippery ice", slippery, 0.5), ("slippery ice", slippery, 0.05)):
+    filled = [list(q_learning(lake, 2_000, seed, step))[-1] for seed in range(3)]
+    shares = ", ".join(f"{share_of_goals(lake, table):.0%}" for table in filled)
+    print(f"{name}, alpha {step}: the goal is reached in {shares} of 500 episodes")
+
+# %% [markdown]
+# On slippery ice, a smaller step averages over more targets, and plays better with each of these seeds.
+
+# %% [markdown]
+# ## The same with a network
+#
+# A table with 16 rows is also a network. Give it the state as 16 numbers, a 1 at the place of the cell and 0
+# everywhere else (*one-hot*). A layer `Dense(4)` without bias multiplies this with its kernel [16, 4], and so picks
+# out one row: the kernel *is* the table.
+#
+# Then one step of gradient descent on the squared error $(y - Q(s, a))^2$ is the update above. Its derivative with
+# respect to $Q(s, a)$ is $-2 \, (y - Q(s, a))$, and all other numbers have none. So the learning rate is $\alpha / 2$.
+# ($y$ counts as a fixed number, although $Q$ is in it.) The targets are the package's `td_targets`.
+
+# %%
+import tensorflow as tf
+
+
+def one_hot(s):
+    """Returns a state as a row of 16 numbers, [1, 16]."""
+    return np.eye(16, dtype=np.float32)[[s]]
+
+
+@tf.function
+def gradient_step(q_network, optimizer, state, a, y):
+    """Takes one step on the squared error of one transition."""
+    with tf.GradientTape() as tape:
+        loss = (y - q_network(state)[0, a]) ** 2
+    weights = q_network.trainable_variables
+    optimizer.apply_gradients(zip(tape.gradient(loss, weights), weights, strict=True))
+
+
+def target(q_hat_network, s, a, r, next_s, terminated):
+    """Returns y of one transition."""
+    batch = (one_hot(s), [a], [r], one_hot(next_s), [float(terminated)])
+    return td_targets(batch, gamma, q_hat_network, q_hat_network)[0]
+
+
+def update(q_network, optimizer, s, a, y):
+    """Moves Q(s, a) towards y."""
+    gradient_step(q_network, optimizer, tf.constant(one_hot(s)), tf.constant(a), tf.constant(y, tf.float32))
+
+
+# %% [markdown]
+# Both learn from the same 500 steps, one after the other: random actions in random cells.
+
+
+# %%
+def new_linear_network():
+    """Returns a network that is a table of zeros, and an optimizer for it."""
+    layer = keras.layers.Dense(4, use_bias=False, kernel_initializer="zeros")
+    network, optimizer = keras.Sequential([keras.Input((16,)), layer]), keras.optimizers.SGD(alpha / 2)
+    optimizer.build(network.trainable_variables)
+    return network, optimizer
+
+
+linear, sgd = new_linear_network()
+table, rng = np.zeros((16, 4), np.float32), np.random.default_rng(0)
+for _ in range(500):
+    s, a = rng.integers(16), rng.integers(4)
+    [(_, next_s, r, terminated)] = env.unwrapped.P[s][a]  # what the step gives
+    y = np.float32(r) + np.float32((1 - terminated) * gamma) * table[next_s].max()
+    table[s, a] += np.float32(alpha) * (y - table[s, a])
+    update(linear, sgd, s, a, target(linear, s, a, r, next_s, terminated))
+
+kernel = linear.get_weights()[0]
+print(f"{table.size} numbers, {np.sum(table != 0)} of them not 0, {np.sum(kernel != table)} of them different")
+np.testing.assert_array_equal(kernel, table)
+
+# %% [markdown]
+# Not one bit is different. So a network is no other algorithm; this one is only a slow way to keep a table.
+#
+# ## A hidden layer
+#
+# A table for CartPole would have a row for each state, and a state there is four real numbers: hardly one ever comes
+# back. A network with a hidden layer can tell something about states that it has never seen, because **states share
+# weights**. The price: an update of one state changes others. The same step ten times, from cell 14 to the goal:
+
+
+# %%
+def new_network():
+    """Returns a network with a hidden layer of 32 units, and an optimizer for it."""
+    network, optimizer = make_q_network(16, 4, hidden_units=(32,), seed=0), keras.optimizers.SGD(0.1)
+    optimizer.build(network.trainable_variables)
+    return network, optimizer
+
+
+hidden, sgd_of_hidden = new_network()
+cells = np.eye(16, dtype=np.float32)  # all states
+for name, network, optimizer in (("no hidden layer", linear, sgd), ("a hidden layer ", hidden, sgd_of_hidden)):
+    before = network(cells).numpy()
+    for _ in range(10):
+        update(network, optimizer, s=14, a=2, y=1.0)
+    change = network(cells).numpy() - before
+    others = np.delete(change.ravel(), 4 * 14 + 2)
+    print(f"{name}: Q(14, right) changes by {change[14, 2]:+.3f};", end=" ")
+    print(f"{np.sum(others != 0)} of the other 63 numbers change, at most by {np.abs(others).max():.3f}")
+
+# %% [markdown]
+# Two difficulties follow, which a table does not have.
+#
+# **The order matters.** We take the right answers for all 64 numbers, each 50 times, and teach them to new networks:
+# cell after cell, as to an agent that stays for long in one part of the lake; and the same ones shuffled.
+
+# %%
+right = np.zeros((16, 4), np.float32)
+for s, a in np.ndindex(16, 4):
+    [(_, next_s, r, terminated)] = env.unwrapped.P[s][a]
+    right[s, a] = r + (1 - terminated) * gamma * q[next_s].max()
+in_order = [(s, a) for s in range(16) for _ in range(50) for a in range(4)]
+shuffled = np.random.default_rng(0).permutation(in_order).tolist()
+for name, make, pairs in (
+    ("no hidden layer, cell after cell", new_linear_network, in_order),
+    ("a hidden layer, cell after cell ", new_network, in_order),
+    ("a hidden layer, shuffled        ", new_network, shuffled),
+):
+    network, optimizer = make()
+    for s, a in pairs:
+        update(network, optimizer, s, a, right[s, a])
+    error = np.abs(network(cells).numpy() - right).mean(axis=1)
+    print(f"{name}: mean error {error.mean():.3f}; in the last cell {error[15]:.3f}, in the worst {error.max():.3f}")
+
+# %% [markdown]
+# **The target moves.** The target of the step from cell 13 to cell 14 is $\gamma \max_{a'} Q(14, a')$. Twenty updates
+# move $Q(13, \text{right})$ towards it, and nothing else is learned. Does the target stay where it was?
+
+
+# %%
+def copy_of(network):
+    """Returns a network with the same weights."""
+    copied = keras.models.clone_model(network)
+    copied.set_weights(network.get_weights())
+    return copied
+
+
+def show_targets(name, network, q_hat_network, learning_rate):
+    """Prints the target before the first and after the last update."""
+    optimizer = keras.optimizers.SGD(learning_rate)
+    optimizer.build(network.trainable_variables)
+    for k in range(21):
+        y = target(q_hat_network, s=13, a=2, r=0.0, next_s=14, terminated=False)
+        if k in (0, 20):
+            value = float(network(one_hot(13))[0, 2])
+            print(f"{name}, after {k:2} updates: Q(13, right) {value:.3f}, its target {y:.3f}")
+        update(network, optimizer, 13, 2, y)
+
+
+other, frozen = copy_of(hidden), copy_of(hidden)
+show_targets("no hidden layer         ", linear, linear, alpha / 2)
+show_targets("a hidden layer          ", hidden, hidden, 0.1)
+show_targets("a hidden layer and Q-hat", other, frozen, 0.1)
+
+# %% [markdown]
+# In the last two lines, the target comes from a copy of the network that stays as it was.
+#
+# So much for what is new with a network. The two ideas that DQN adds to Q-learning answer just this: a **replay
+# memory**, from which the steps are drawn in random order, and a **target network**, the copy. The lesson,
+# [deep_q_network.ipynb](deep_q_network.ipynb), builds both, for a task with too many states for a table.

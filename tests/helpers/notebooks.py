@@ -1,0 +1,9 @@
+"""notebooks/render.py as a module, which is no package."""
+
+import importlib.util
+from pathlib import Path
+
+NOTEBOOKS = Path(__file__).parent.parent.parent / "notebooks"
+spec = importlib.util.spec_from_file_location("render", NOTEBOOKS / "render.py")
+render = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(render)
