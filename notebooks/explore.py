@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Explore
 #
-# Move a number, and see what becomes of eight training runs and of the pole. Each move trains eight agents anew, which
-# takes about a second, since other numbers need no other program. Only a new value of the last slider compiles one, for
-# some seconds.
+# Move a number, and see what becomes of eight training runs and of the pole. Each move trains eight new agents. That
+# takes a second or two, because other numbers need no other program. Only a new value of the last slider compiles one,
+# for some seconds.
 #
 # The sliders need a running notebook and `pip install "dqn_keras[explore]"`. Without them, call the function yourself:
 # `explore(gamma=0.99)`.
@@ -13,6 +13,7 @@ import os
 
 os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # otherwise TensorFlow logs into the notebook
 os.environ["SDL_VIDEODRIVER"] = "dummy"  # pictures are drawn without a display
+os.environ["TF_NUM_INTRAOP_THREADS"] = "1"  # faster, since the network is small
 
 import gymnasium as gym
 import matplotlib.pyplot as plt
@@ -69,18 +70,28 @@ except ImportError:
 else:
 
     def slider(kind, value, **options):
-        """Returns a slider that reports its value only when it is released."""
-        return kind(
-            value, continuous_update=False, layout={"width": "420px"}, style={"description_width": "130px"}, **options
-        )
+        """Returns a slider that reports its value when it is released."""
+        options |= {"layout": {"width": "420px"}, "style": {"description_width": "130px"}}
+        return kind(value=value, continuous_update=False, **options)
 
-    number, power = widgets.FloatSlider, widgets.FloatLogSlider
+    number, power, choice = widgets.FloatSlider, widgets.FloatLogSlider, widgets.SelectionSlider
     sliders = {
-        "gamma": slider(number, 0.95, min=0.5, max=0.999, step=0.001, readout_format=".3f", description="gamma"),
-        "tau": slider(power, 0.01, min=-3, max=0, step=0.1, readout_format=".3f", description="tau"),
-        "alpha": slider(power, 0.001, min=-5, max=-1, step=0.1, readout_format=".5f", description="alpha"),
-        "decay": slider(number, 0.995, min=0.9, max=0.999, step=0.001, readout_format=".3f", description="decay"),
-        "epsilon_min": slider(number, 0.1, min=0, max=0.5, step=0.01, description="epsilon_min"),
-        "steps_per_update": slider(widgets.SelectionSlider, 4, options=[1, 2, 4, 8], description="steps_per_update"),
+        "gamma": slider(number, 0.95, min=0.5, max=0.999, step=0.001, readout_format=".3f"),
+        "tau": slider(power, 0.01, min=-3, max=0, step=0.1, readout_format=".3f"),
+        "alpha": slider(power, 0.001, min=-5, max=-1, step=0.1, readout_format=".5f"),
+        "decay": slider(number, 0.995, min=0.9, max=0.999, step=0.001, readout_format=".3f"),
+        "epsilon_min": slider(number, 0.1, min=0, max=0.5, step=0.01),
+        "steps_per_update": slider(choice, 4, options=[1, 2, 4, 8]),
     }
-    display(widgets.VBox([*sliders.values(), widgets.interactive_output(explore, sliders)]))
+    output = widgets.Output()
+
+    def redraw(_):
+        """Explores with the values of all sliders."""
+        with output:
+            output.clear_output(wait=True)
+            explore(**{name: widget.value for name, widget in sliders.items()})
+
+    for name, widget in sliders.items():
+        widget.description = name
+        widget.observe(redraw, "value")
+    display(widgets.VBox([*sliders.values(), output]))
