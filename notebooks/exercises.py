@@ -513,9 +513,9 @@ def _():
 
 # %% [markdown]
 # What does it do? To see much of it, the time is short: 25 steps. The pole is upright and still, in the middle: an
-# agent that balances will stay there, and if time did not count, the value would be near $1 / (1 - \gamma) = 20$.
-# **Predict first**: with the mistake, will the network's value of this state be higher or lower? And will the agent
-# balance worse in episodes of full length?
+# agent that balances will stay there, and if time did not count, the value would end up near $1 / (1 - \gamma) = 20$
+# (the training here is too short to get so far). **Predict first**: with the mistake, will the network's value of this
+# state be higher or lower? And will the agent balance worse in episodes of full length?
 
 # %%
 if 5 in solved:
