@@ -9,7 +9,8 @@
 # networks: a *replay memory* and a *target network*
 # ([Mnih et al. 2015](https://www.nature.com/articles/nature14236)). You write each part yourself in a few lines, and
 # a check compares it with the package `dqn_keras`. Change the code and see what happens. It takes about half an hour
-# to read. "S&B" is [Sutton and Barto's book](http://incompleteideas.net/book/the-book-2nd.html), second edition.
+# to read; [From a table to a network](from_a_table.ipynb) is a gentler start. "S&B" is
+# [Sutton and Barto's book](http://incompleteideas.net/book/the-book-2nd.html), second edition.
 
 # %%
 import os
@@ -519,7 +520,6 @@ Markdown(dqn_keras.sweep_table(outcome))
 # ## The claim, checked
 #
 # The original notebook reports its run as solved in 293 episodes. That is one seed, and so is the one above.
-# [How reliable is it?](how_reliable.ipynb) asks a hundred.
 
 # %%
 assert run.solved_at is not None, "this seed was not solved within 2,000 episodes"
@@ -527,3 +527,12 @@ assert run.rewards[-config.solved_window :].mean() > config.solved_reward
 assert returns.mean() > 100, "greedy play should be far better than the 20 or so of random actions"
 assert outcome["preset (gamma 0.99)"].greedy_returns.mean() > 450
 print(f"Solved in {run.solved_at} episodes, after {run.agent.num_updates:,} learning steps.")
+
+# %% [markdown]
+# ## Go on
+#
+# - [Exercises](exercises.ipynb): write the parts yourself, with checks that say what is wrong.
+# - [Does it need this?](does_it_need_this.ipynb): take parts away, and predict what happens to a hundred seeds.
+# - [Explore](explore.ipynb): sliders for the numbers.
+# - [How reliable is it?](how_reliable.ipynb): a hundred seeds, the ones that fail, and why.
+# - [Your own environment](your_own_environment.ipynb): from an idea to a trained agent in ten cells.
