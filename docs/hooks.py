@@ -22,6 +22,7 @@ ALT_TEXTS = {  # of the pictures in the notebooks, by the tag of their cell
     "save-catch": "The moving picture of an episode: the paddle catches ball after ball",
     "picture-table": "The lake after 0 to 1,000 episodes: values spread from the goal to the start, arrows lead there",
     "picture-wrong_states": "What Q says against what is measured: closer for states met in training than at random",
+    "save-does_it_need_this": "Share not solved by episode 500, median episodes and greedy return for nine settings",
     "save-one_collapse": "One seed that got stuck: reward, greedy return, highest Q, share of terminal transitions",
 }
 

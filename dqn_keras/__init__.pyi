@@ -12,6 +12,7 @@ from .learn import update_q_hat as update_q_hat
 from .metrics import Episode as Episode
 from .networks import make_networks as make_networks
 from .networks import make_q_network as make_q_network
+from .plotting import plot_q as plot_q
 from .plotting import plot_rewards as plot_rewards
 from .plotting import plot_run as plot_run
 from .plotting import plot_study as plot_study

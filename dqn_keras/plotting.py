@@ -1,4 +1,4 @@
-"""Learning curves: of one run, together with its other logged values, and of many runs."""
+"""Pictures: learning curves of one run and of many, and the Q-values of a network."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -7,6 +7,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
+from dqn_keras._engine.tensorflow import keras
+from dqn_keras.checks.networks import check_network
 from dqn_keras.checks.numbers import (
     check_array,
     check_choice,
@@ -94,6 +96,90 @@ def plot_history(history: Mapping[str, Sequence[float]], config: Config, speed: 
         ax.set_xlabel("Episode")
     rewards.locator_params(axis="x", nbins=6)  # for all panels, which share the x-axis
     return np.array([rewards, *panels])
+
+
+def plot_q(
+    q_network: keras.Model,
+    x: tuple[int, float, float],
+    y: tuple[int, float, float],
+    state: Sequence[float] | np.ndarray | None = None,
+    ax: Axes | None = None,
+    limits: tuple[float, float] | None = None,
+) -> Axes:
+    """Plots the Q-values of a network over two entries of the state, in which all other entries are fixed.
+
+    The colour is max_a Q(s, a). The hatching is the greedy action: none for action 0, lines for action 1, and other
+    lines for each further action.
+
+    Args:
+        q_network: a network of states that are vectors: [B, N] -> Q-values [B, A].
+        x: the entry of the state along the x-axis: its index, its lowest and its highest value.
+        y: the entry along the y-axis, in the same form.
+        state: the values of the other entries, [N]; by default, they are 0.
+        ax: the Axes to draw in; by default those of a new figure, 6 by 4.5 inches, with a colour bar.
+        limits: the Q-values of the darkest and the brightest colour; by default, the lowest and the highest plotted.
+
+    Raises:
+        TypeError, ValueError: an argument is wrong; the message names it.
+    """
+    check_network("q_network", q_network)
+    if len(q_network.input_shape) != 2:
+        raise ValueError(f"q_network must take vectors, [B, N], got an input of shape {q_network.input_shape}")
+    num_features = q_network.input_shape[-1]
+    state = check_array("state", np.zeros(num_features) if state is None else state, num_axes=1)
+    if state.shape != (num_features,):
+        raise ValueError(f"state must have {num_features} entries, as q_network takes them, got {state.shape[0]}")
+    if not np.isfinite(state).all():
+        raise ValueError(f"state must be finite, got {shown(state)}")
+    limits = None if limits is None else _limits(limits)
+    (i, xs), (j, ys) = _entry("x", x, num_features), _entry("y", y, num_features)
+    if i == j:
+        raise ValueError(f"x and y must be different entries of the state, got {i} for both")
+    states = np.tile(state.astype(np.float32), (len(ys), len(xs), 1))  # [Y, X, N]
+    states[..., i], states[..., j] = np.meshgrid(xs, ys)
+    q_values = np.asarray(q_network(states.reshape(-1, num_features))).reshape(len(ys), len(xs), -1)
+    return _draw_q(xs, ys, q_values, ax, limits or (q_values.max(-1).min(), q_values.max()))
+
+
+def _entry(name: str, entry: Any, num_features: int) -> tuple[int, np.ndarray]:
+    """Returns the index of an entry of the state, and 61 values of it."""
+    values = check_sequence(name, entry, "an index and two values")
+    if len(values) != 3:
+        raise ValueError(f"{name} must be an index, a lowest and a highest value, got {shown(entry)}")
+    index = check_count(f"{name}[0]", values[0], at_least=0)
+    if index >= num_features:
+        raise ValueError(f"{name}[0] must be an index of the state's {num_features} entries, got {index}")
+    low, high = (check_number(f"{name}[{k}]", values[k]) for k in (1, 2))
+    if low >= high:
+        raise ValueError(f"{name} must have its lowest value before its highest, got {shown(entry)}")
+    return index, np.linspace(low, high, 61)
+
+
+def _limits(limits: Any) -> tuple[float, float]:
+    values = check_sequence("limits", limits, "two Q-values")
+    if len(values) != 2:
+        raise ValueError(f"limits must be two Q-values, got {len(values)}")
+    low, high = (check_number("limits", value) for value in values)
+    if low >= high:
+        raise ValueError(f"limits must be two Q-values, the lower first, got {low:g} and {high:g}")
+    return low, high
+
+
+def _draw_q(xs: np.ndarray, ys: np.ndarray, q_values: np.ndarray, ax: Axes | None, limits: tuple) -> Axes:
+    """Draws max_a Q as colours and the greedy action as hatching; q_values are [Y, X, A]."""
+    has_bar = ax is None
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6, 4.5), layout="constrained")
+    check_instance("ax", ax, Axes, "an Axes of Matplotlib")
+    low, high = limits
+    image = ax.pcolormesh(xs, ys, q_values.max(axis=-1), vmin=low, vmax=high, shading="gouraud", rasterized=True)
+    actions = np.arange(q_values.shape[-1] + 1) - 0.5
+    hatches = [None, "//", "\\\\", "xx", "..", "--", "||", "++"]
+    with plt.rc_context({"hatch.color": "white", "hatch.linewidth": 0.5}):
+        ax.contourf(xs, ys, q_values.argmax(axis=-1), levels=actions, colors="none", hatches=hatches)
+    if has_bar:
+        ax.figure.colorbar(image, ax=ax, label="max over a of Q(s, a)")
+    return ax
 
 
 def plot_study(

@@ -11,6 +11,7 @@ import tempfile
 import threading
 import time
 import uuid
+import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -169,6 +170,9 @@ def _by_joblib(settings: Mapping[str, _Pickled], tasks: Sequence[Task], num_work
             outcome = _train_seed(settings[task.name], task.seed)
             yield None if outcome is None else (task, outcome)
         return
+    # loky replaces a worker whose memory has grown, as when an optimizer is compiled for each seed. The next
+    # one continues, and no seed is lost.
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor", UserWarning)
     backend = parallel_config(backend="loky", inner_max_num_threads=1)
     with backend, _compilation_cache_in_children(), _interrupts_ignored_by_children():
         parallel = Parallel(

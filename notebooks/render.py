@@ -21,6 +21,7 @@ from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parent
 RESULTS = NOTEBOOKS.parent / "results"
+WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 def sources() -> list[Path]:
@@ -62,10 +63,12 @@ def render(source: Path) -> list[Path]:
     notebook = list(notebooks.values())[-1]
     metadata = copy.deepcopy(notebook.metadata)
     NotebookClient(
-        notebook, timeout=300, record_timing=False, coalesce_streams=True, resources={"metadata": {"path": NOTEBOOKS}}
+        notebook, timeout=1200, record_timing=False, coalesce_streams=True, resources={"metadata": {"path": NOTEBOOKS}}
     ).execute()
     notebook.metadata = metadata  # without the versions that the run has put in
     for cell in notebook.cells:
+        if "outputs" in cell:  # a widget lives only as long as its kernel
+            cell.outputs = [output for output in cell.outputs if WIDGET not in output.get("data", {})]
         for tag in (tag for tag in tags(cell) if tag.startswith("save-")):
             pictures = [output.data["image/png"] for output in cell.outputs if "image/png" in output.get("data", {})]
             (RESULTS / f"{tag.removeprefix('save-')}.png").write_bytes(base64.b64decode(pictures[0]))

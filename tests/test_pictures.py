@@ -12,6 +12,7 @@ from dqn_keras import (
     animate,
     evaluate,
     make_q_network,
+    plot_q,
     plot_rewards,
     plot_run,
     record_episode,
@@ -130,3 +131,49 @@ def test_a_run_at_a_glance_shows_its_history(cartpole, speed):
             scale = 100 if name == "terminal_share" else 1
             np.testing.assert_array_equal(line.get_ydata(), scale * np.array(run.history[name]))
         assert ax.get_title() and ax.get_ylabel()  # noqa: PT018
+
+
+def _linear_q_network():
+    """Q(s, 0) = s[1], Q(s, 1) = 2 s[3]."""
+    network = make_q_network(4, 2, hidden_units=(8,), seed=0)
+    first, second = np.zeros((4, 8)), np.zeros((8, 2))
+    for entry, unit, sign in ((1, 0, 1), (1, 1, -1), (3, 2, 1), (3, 3, -1)):  # x = relu(x) - relu(-x)
+        first[entry, unit] = sign
+        second[unit, entry // 2] = sign * (1 if entry == 1 else 2)
+    network.set_weights([first, np.zeros(8), second, np.zeros(2)])
+    return network
+
+
+def test_q_is_plotted_over_two_entries_of_the_state():
+    ax = plot_q(_linear_q_network(), x=(1, -1, 1), y=(3, 0, 2))
+    image, *actions = ax.collections
+    xs, ys = np.meshgrid(np.linspace(-1, 1, 61), np.linspace(0, 2, 61))
+    np.testing.assert_allclose(image.get_array(), np.maximum(xs, 2 * ys), atol=1e-5)
+    assert image.norm.vmin == pytest.approx(0, abs=1e-5)
+    assert image.norm.vmax == pytest.approx(4)
+    right_of_the_border = [path.contains_point(point) for path in actions[0].get_paths() for point in [(0.9, 0.1)]]
+    assert right_of_the_border == [True, False]  # Q(s, 0) = 0.9 is higher than Q(s, 1) = 0.2
+    assert [hatch or "" for hatch in actions[0].hatches[:2]] == ["", "//"]
+
+
+def test_the_other_entries_of_the_state_stay_as_they_are():
+    _, ax = plt.subplots()
+    assert plot_q(_linear_q_network(), x=(0, -1, 1), y=(2, -1, 1), state=[0, 5, 0, 1], ax=ax, limits=(0, 9)) is ax
+    np.testing.assert_allclose(ax.collections[0].get_array(), 5, rtol=1e-6)
+    assert (ax.collections[0].norm.vmin, ax.collections[0].norm.vmax) == (0, 9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"x": (4, 0, 1)}, r"^x\[0\] must be an index of the state's 4 entries, got 4"),
+        ({"x": (0, 1, 1)}, r"^x must have its lowest value before its highest"),
+        ({"y": (0, 0, 1)}, r"^x and y must be different entries of the state, got 0 for both"),
+        ({"y": (1, 0)}, r"^y must be an index, a lowest and a highest value"),
+        ({"state": [0.0]}, r"^state must have 4 entries, as q_network takes them, got 1"),
+        ({"limits": (2, 1)}, r"^limits must be two Q-values, the lower first"),
+    ],
+)
+def test_a_plot_of_q_that_makes_no_sense_is_an_error(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        plot_q(make_q_network(4, 2, seed=0), **{"x": (0, 0, 1), "y": (1, 0, 1)} | arguments)

@@ -537,6 +537,30 @@ def picture_doors() -> Iterator[tuple[str, Door]]:
         ),
     )
     yield (
+        "plot_q",
+        Door(
+            dqn_keras.plot_q,
+            lambda: {
+                "q_network": shared()["q"],
+                "x": (0, 0, 1),
+                "y": (1, 0, 1),
+                "state": None,
+                "ax": None,
+                "limits": None,
+            },
+            {
+                "q_network": named(
+                    "a right network", *UNUSUAL, "a network for other states", "a network for other actions"
+                ),
+                "x": nothing,
+                "y": nothing,
+                "state": named("None", "zeros(2)", "a tensor [2]", "[1, 2]"),
+                "ax": named("an Axes", "None"),
+                "limits": named("None", "[1, 2]"),
+            },
+        ),
+    )
+    yield (
         "plot_study",
         Door(
             dqn_keras.plot_study,
