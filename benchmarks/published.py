@@ -268,11 +268,13 @@ Every run: [published.csv](published.csv).
 The settings are rl-zoo3's (`hyperparams/dqn.yml`). "Published" is sb3-contrib's table for them
 (`docs/modules/qrdqn.md`): the mean over 3 to 5 seeds of 10 greedy episodes, ± the standard error. "SB3 here" is
 Stable-Baselines3's DQN, run with these settings. "torch's start" is this package, with networks that start as torch's
-do, and "Keras' start" is this package with its own networks.
+do, and "Keras' start" is this package with its own networks. Adam's epsilon is torch's in all of them, 1e-8; Keras' own
+is 1e-7.
 
 A cell holds the mean over the seeds (from 5 seeds on, its 95 % interval, percentile bootstrap over the seeds), the
 median and the number of seeds; each seed counts with its mean return. In the columns p, this package is compared with
 "SB3 here": the p-values of Mann-Whitney's U, and of a permutation test of the difference of the means.
+A high p does not prove that the two are equal: with so few seeds, only large differences would show.
 """)
     measures = {
         "## 100 greedy episodes after training": "greedy_return",
