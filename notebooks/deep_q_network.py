@@ -25,9 +25,10 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"  # pictures are drawn without a display
 # %%
 import importlib.util
 
+from IPython import get_ipython
+
 if importlib.util.find_spec("dqn_keras") is None:
-    # %pip install --quiet "..[notebooks]"
-    pass
+    get_ipython().run_line_magic("pip", 'install --quiet "..[notebooks]"')
 
 # Imported before Keras, the package keeps TensorFlow's messages out of the notebook.
 import dqn_keras
