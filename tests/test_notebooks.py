@@ -59,9 +59,9 @@ def test_a_cell_that_is_run_twice_does_no_harm(capsys, monkeypatch):
     monkeypatch.chdir(NOTEBOOKS)
     cells = [cell.source for cell in rendered(NOTEBOOKS / "deep_q_network.py").cells if cell.cell_type == "code"]
     namespace, lines = {}, []
-    for cell in cells:
+    for cell in cells[: next(i for i, cell in enumerate(cells) if "sweep(" in cell)]:
         for _ in range(2):
             exec(compile(cell, "notebook", "exec"), namespace)
         lines += [line for line in capsys.readouterr().out.splitlines() if line.startswith("Solved")]
-    assert len(lines) == 4
+    assert len(lines) == 2
     assert lines[::2] == lines[1::2]
