@@ -33,7 +33,7 @@ format: .venv/installed
 docs: .venv/docs-installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	$(BIN)/python docs/check.py
-	$(BIN)/python -m pytest --quiet tests/test_watch_it_learn.py
+	$(BIN)/python -m pytest --quiet -m "not slow" tests/test_watch_it_learn.py
 
 docs-serve: .venv/docs-installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs serve

@@ -15,7 +15,8 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import unquote, urldefrag, urlsplit
 
-from playwright.sync_api import Browser, Page, Request, TimeoutError, sync_playwright
+from playwright.sync_api import Browser, Page, Request, sync_playwright
+from playwright.sync_api import TimeoutError as PlaywrightTimeout
 
 SITE = Path(__file__).parent.parent / "site"
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -146,7 +147,7 @@ def finds(page: Page, host: str, word: str) -> bool:
     try:
         page.locator("input.md-search__input").fill(word)
         page.locator("a.md-search-result__link").first.wait_for(state="attached")
-    except TimeoutError:
+    except PlaywrightTimeout:
         return False
     return True
 
@@ -156,7 +157,7 @@ def plays(page: Page, host: str) -> bool:
     page.goto(f"{host}/watch_it_learn.html")
     try:
         page.wait_for_function("parseInt(document.querySelector('#step').textContent) > 5")
-    except TimeoutError:
+    except PlaywrightTimeout:
         return False
     return True
 

@@ -14,7 +14,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
 ALT_TEXTS = {  # of the pictures in the notebooks, by the tag of their cell
-    "save-rewards": "Episode rewards of one run: about 20 for 170 episodes, then a climb to over 225",
+    "save-rewards": "Episode rewards of one run: 20 and less for 170 episodes, then a climb to over 225",
     "save-pole": "The moving picture of one greedy episode: the network keeps the pole upright",
     "save-hundred_seeds": "A hundred seeds: learning curves, episodes to solved, share solved by episode",
     "save-slow_target": "Share not solved by episode 500, median episodes and greedy return for four values of tau",
@@ -43,7 +43,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def notebook_blocks(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
     """A notebook with its committed outputs as Markdown; nothing is executed. `pictures` is filled by file name."""
-    heading, cells = "", nbformat.read(path, as_version=4).cells
+    heading = ""
+    cells = nbformat.read(path, as_version=4).cells
     kind = "A notebook, with its outputs" if any(cell.get("outputs") for cell in cells) else "A notebook to work in"
     for cell in cells:
         if cell.cell_type == "markdown":

@@ -108,8 +108,8 @@ def plot_q(
 ) -> Axes:
     """Plots the Q-values of a network over two entries of the state, in which all other entries are fixed.
 
-    The colour is max_a Q(s, a). The hatching is the greedy action: none for action 0, lines for action 1, and other
-    lines for each further action.
+    The colour is max_a Q(s, a). The hatching is the greedy action: none for action 0, lines for action 1, and another
+    kind for each further action up to 7; after that, the kinds repeat.
 
     Args:
         q_network: a network of states that are vectors: [B, N] -> Q-values [B, A].
@@ -165,6 +165,9 @@ def _limits(limits: Any) -> tuple[float, float]:
     return low, high
 
 
+HATCHES = ("//", "\\\\", "xx", "..", "--", "||", "++")
+
+
 def _draw_q(xs: np.ndarray, ys: np.ndarray, q_values: np.ndarray, ax: Axes | None, limits: tuple) -> Axes:
     """Draws max_a Q as colours and the greedy action as hatching; q_values are [Y, X, A]."""
     has_bar = ax is None
@@ -173,10 +176,11 @@ def _draw_q(xs: np.ndarray, ys: np.ndarray, q_values: np.ndarray, ax: Axes | Non
     check_instance("ax", ax, Axes, "an Axes of Matplotlib")
     low, high = limits
     image = ax.pcolormesh(xs, ys, q_values.max(axis=-1), vmin=low, vmax=high, shading="gouraud", rasterized=True)
-    actions = np.arange(q_values.shape[-1] + 1) - 0.5
-    hatches = [None, "//", "\\\\", "xx", "..", "--", "||", "++"]
+    greedy_actions = q_values.argmax(axis=-1)
     with plt.rc_context({"hatch.color": "white", "hatch.linewidth": 0.5}):
-        ax.contourf(xs, ys, q_values.argmax(axis=-1), levels=actions, colors="none", hatches=hatches)
+        for action in range(1, q_values.shape[-1]):
+            hatch = HATCHES[(action - 1) % len(HATCHES)]
+            ax.contourf(xs, ys, greedy_actions == action, levels=[0.5, 1.5], colors="none", hatches=[hatch])
     if has_bar:
         ax.figure.colorbar(image, ax=ax, label="max over a of Q(s, a)")
     return ax

@@ -170,7 +170,7 @@ def _by_joblib(settings: Mapping[str, _Pickled], tasks: Sequence[Task], num_work
             outcome = _train_seed(settings[task.name], task.seed)
             yield None if outcome is None else (task, outcome)
         return
-    # loky replaces a worker whose memory has grown, as when an optimizer is compiled for each seed. The next
+    # loky replaces a worker whose memory has grown, for example when an optimizer is compiled for each seed. The next
     # one continues, and no seed is lost.
     warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor", UserWarning)
     backend = parallel_config(backend="loky", inner_max_num_threads=1)

@@ -659,7 +659,7 @@ def _():
 # %% [markdown]
 # **Predict first**: does it learn earlier, later, or does it make no difference? Then measure with a `sweep` over the
 # seeds `range(20)`. A setting may have an environment of its own: `{"env": FallCosts()}`. Call the settings `"+1"` and
-# `"-1"`. (In the second one, an episode of the same length counts 2 less, so that its bar is a little higher.)
+# `"-1"`. (In the second one, an episode of the same length counts 2 less, so its bar is 2 higher.)
 
 # %% tags=["student"]
 by_reward = None  # your code here
@@ -937,8 +937,8 @@ repaired = {"A": right_targets, "B": right_targets, "C": right_choice, "D": righ
 @check(10)
 def _():
     missing = [name for name in agents if repaired.get(name) is None]
-    for function, name in {repaired[name]: name for name in sorted(agents.keys() - missing)}.items():
-        (part,) = agents[name]
+    different = {(*agents[name], repaired[name]): name for name in sorted(agents.keys() - missing)}
+    for (part, function), name in different.items():
         for probe in probes:
             what = run_probe(probes[probe], **{part: function})
             assert not what, f"{name} fails in probe {probe}: {what}"

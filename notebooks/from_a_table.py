@@ -3,7 +3,8 @@
 #
 # A DQN is Q-learning with a network where there used to be a table. This notebook begins with the table, which one can
 # see filling. Then it makes the same step with a network, and gets the same numbers. Then it gives the network a
-# hidden layer, and something new happens. It takes about ten minutes to read; you need no more than Python and NumPy.
+# hidden layer, and something new happens. It takes about twenty minutes to read. The first half needs only Python and
+# NumPy; the second half uses Keras.
 
 # %%
 import os
@@ -138,7 +139,7 @@ for name, lake, step in (("firm ice", env, 0.5), ("slippery ice", slippery, 0.5)
     print(f"{name}, alpha {step}: the goal is reached in {shares} of 500 episodes")
 
 # %% [markdown]
-# On slippery ice, a smaller step averages over more targets, and plays better with each of these seeds.
+# On slippery ice, the table with the smaller step plays better with each of these seeds.
 
 # %% [markdown]
 # ## The same with a network
@@ -148,8 +149,9 @@ for name, lake, step in (("firm ice", env, 0.5), ("slippery ice", slippery, 0.5)
 # out one row: the kernel *is* the table.
 #
 # Then one step of gradient descent on the squared error $(y - Q(s, a))^2$ is the update above. Its derivative with
-# respect to $Q(s, a)$ is $-2 \, (y - Q(s, a))$, and all other numbers have none. So the learning rate is $\alpha / 2$.
-# ($y$ counts as a fixed number, although $Q$ is in it.) The targets are the package's `td_targets`.
+# respect to $Q(s, a)$ is $-2 \, (y - Q(s, a))$, and for all other numbers it is 0. So the learning rate is
+# $\alpha / 2$. ($y$ counts as a fixed number, although $Q$ is in it.) The targets are the package's `td_targets`. It
+# asks for two networks; here, both are the same.
 
 # %%
 import tensorflow as tf
@@ -207,7 +209,7 @@ print(f"{table.size} numbers, {np.sum(table != 0)} of them not 0, {np.sum(kernel
 np.testing.assert_array_equal(kernel, table)
 
 # %% [markdown]
-# Not one bit is different. So a network is no other algorithm; this one is only a slow way to keep a table.
+# Not one bit is different. So the algorithm is the same. This network is just a slower table.
 #
 # ## A hidden layer
 #
@@ -290,7 +292,8 @@ show_targets("a hidden layer          ", hidden, hidden, 0.1)
 show_targets("a hidden layer and Q-hat", other, frozen, 0.1)
 
 # %% [markdown]
-# In the last two lines, the target comes from a copy of the network that stays as it was.
+# With a hidden layer, the target has moved along, to 1.121. That is too high: the right value is 0.9, and no value here
+# can be above 1. In the last two lines, the target comes from a copy of the network that stays as it was.
 #
 # So much for what is new with a network. The two ideas that DQN adds to Q-learning answer just this: a **replay
 # memory**, from which the steps are drawn in random order, and a **target network**, the copy. The lesson,

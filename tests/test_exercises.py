@@ -187,6 +187,8 @@ def test_the_check_of_the_probes_names_agent_and_probe(machinery, capsys):
     ):
         said = verdict(namespace, 10, f"repaired = {none}\nrepaired['{name}'] = {part}", capsys)
         assert f"not right yet: {name} fails in probe {probe}: " in said
+    both = f"repaired = {none}\nrepaired['A'] = repaired['C'] = action"  # right for C, but no targets
+    assert "Exercise 10: an error" in verdict(namespace, 10, both, capsys)
     assert "A, B, C, D not repaired" in verdict(namespace, 10, f"repaired = {none}\nrepaired['E'] = td_targets", capsys)
 
 

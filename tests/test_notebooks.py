@@ -65,3 +65,43 @@ def test_a_cell_that_is_run_twice_does_no_harm(capsys, monkeypatch):
         lines += [line for line in capsys.readouterr().out.splitlines() if line.startswith("Solved")]
     assert len(lines) == 2
     assert lines[::2] == lines[1::2]
+
+
+SCRIPT = """# %% tags=["student"]
+# your code here
+
+# %% tags=["solution"]
+answer = 42
+
+# %% tags=["save-line"]
+import matplotlib.pyplot as plt
+
+_ = plt.plot([1, 2])
+
+# %%
+import ipywidgets
+from IPython.display import display
+
+display(ipywidgets.FloatSlider())
+print(answer)
+"""
+
+
+@pytest.mark.slow
+def test_a_script_is_rendered_for_students_and_with_solutions_and_without_widgets(tmp_path, monkeypatch):
+    monkeypatch.setattr(render, "NOTEBOOKS", tmp_path)
+    monkeypatch.setattr(render, "RESULTS", tmp_path)
+    script = tmp_path / "example.py"
+    script.write_text(SCRIPT)
+    paths = render.render(script)
+    assert [path.name for path in paths] == ["example.ipynb", "example_solutions.ipynb"]
+    students, solutions = (nbformat.read(path, 4).cells for path in paths)
+    assert students[0].source == "# your code here"
+    assert not any(cell.outputs for cell in students)
+    assert solutions[0].source == "answer = 42"
+    (picture,) = (output.data["image/png"] for output in solutions[1].outputs)
+    assert base64.b64decode(picture) == (tmp_path / "line.png").read_bytes()
+    assert [output.get("text") for output in solutions[2].outputs] == ["42\n"]
+    before = [path.read_bytes() for path in paths]
+    render.render(script)
+    assert [path.read_bytes() for path in paths] == before

@@ -151,9 +151,20 @@ def test_q_is_plotted_over_two_entries_of_the_state():
     np.testing.assert_allclose(image.get_array(), np.maximum(xs, 2 * ys), atol=1e-5)
     assert image.norm.vmin == pytest.approx(0, abs=1e-5)
     assert image.norm.vmax == pytest.approx(4)
-    right_of_the_border = [path.contains_point(point) for path in actions[0].get_paths() for point in [(0.9, 0.1)]]
-    assert right_of_the_border == [True, False]  # Q(s, 0) = 0.9 is higher than Q(s, 1) = 0.2
-    assert [hatch or "" for hatch in actions[0].hatches[:2]] == ["", "//"]
+    (of_action_1,) = actions
+    assert list(of_action_1.hatches) == ["//"]
+    (path,) = of_action_1.get_paths()
+    assert path.contains_point((0.1, 0.9))  # Q(s, 1) = 1.8 is higher than Q(s, 0) = 0.1
+    assert not path.contains_point((0.9, 0.1))  # Q(s, 1) = 0.2 is lower than Q(s, 0) = 0.9
+
+
+def test_where_two_actions_meet_no_other_is_plotted_between_them():
+    network = make_q_network(2, 3, hidden_units=(2,), seed=0)
+    weights = [[1, -1], [0, 0]], [0, 0], [[1, 0, 0], [0, 0, 1]], [0, -1, 0]
+    network.set_weights([np.array(x) for x in weights])  # Q = relu(x), -1, relu(-x)
+    _, of_action_1, of_action_2 = plot_q(network, x=(0, -1, 1), y=(1, -1, 1)).collections
+    assert sum(len(path) for path in of_action_1.get_paths()) == 0
+    assert of_action_2.get_paths()[0].contains_point((-0.5, 0))
 
 
 def test_the_other_entries_of_the_state_stay_as_they_are():

@@ -8,7 +8,7 @@ const TOTAL_MASS = MASS_CART + MASS_POLE;
 const HALF_LENGTH = 0.5; // m
 const POLE_MOMENT = MASS_POLE * HALF_LENGTH; // kg m
 const FORCE = 10.0; // N
-const TAU = 0.02; // s, one step
+const TIME_STEP = 0.02; // s, one step
 const MAX_ANGLE = (12 * 2 * Math.PI) / 360; // rad
 const MAX_POSITION = 2.4; // m
 const MAX_STEPS = 500; // then time is up
@@ -27,10 +27,10 @@ function transition(state, force) {
     (GRAVITY * sin - cos * push) / (HALF_LENGTH * (4.0 / 3.0 - (MASS_POLE * cos ** 2) / TOTAL_MASS));
   const acceleration = push - (POLE_MOMENT * angularAcceleration * cos) / TOTAL_MASS;
   return [
-    position + TAU * velocity,
-    velocity + TAU * acceleration,
-    angle + TAU * angularVelocity,
-    angularVelocity + TAU * angularAcceleration,
+    position + TIME_STEP * velocity,
+    velocity + TIME_STEP * acceleration,
+    angle + TIME_STEP * angularVelocity,
+    angularVelocity + TIME_STEP * angularAcceleration,
   ];
 }
 

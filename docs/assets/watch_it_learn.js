@@ -77,8 +77,8 @@
     const frame = (now) => {
       behind += clip(now - last, 0, 100); // a page that was hidden does not catch up
       last = now;
-      for (; behind >= 1000 * TAU; behind -= 1000 * TAU) step();
-      draw(behind / (1000 * TAU));
+      for (; behind >= 1000 * TIME_STEP; behind -= 1000 * TIME_STEP) step();
+      draw(behind / (1000 * TIME_STEP));
       request = requestAnimationFrame(frame);
     };
     request = requestAnimationFrame(frame);
