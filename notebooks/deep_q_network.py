@@ -304,7 +304,7 @@ print("rewards of the first episodes:", *(f"{reward:.0f}" for reward in my_rewar
 # %% [markdown]
 # The package's `train` does the same, only faster. It trains until the mean of the last 50 rewards is above 225, or
 # 2,000 episodes are over. (225 is the original notebook's bar. Gymnasium's own is a mean of 475 over 100 episodes.)
-# A Keras callback keeps the weights of some episodes for the pictures below.
+# A Keras callback, which `train` calls after each episode, keeps the weights of some episodes for the pictures below.
 
 
 # %%
@@ -354,18 +354,23 @@ _ = ax.axhline(config.solved_reward, color="gray", linestyle=":")
 # The next panels show what the run recorded for each episode. The last one shows how old the experience is from which
 # the agent learns.
 
+
 # %%
+def median_age(steps):
+    """Returns, for each episode, how many episodes ago the median transition of the memory was stored."""
+    total = np.cumsum(steps)  # transitions so far, [episodes]
+    kept = np.minimum(total, config.memory_size)
+    return np.arange(len(steps)) - np.searchsorted(total, total - kept / 2)
+
+
 history = run.history
-steps = np.cumsum(history["steps"])  # after each episode
-kept = np.minimum(steps, config.memory_size)
-half = np.searchsorted(steps, steps - kept / 2)  # the episode from which the median transition in the memory is
 panels = {
     "Epsilon": history["epsilon"],
     "Loss": history["loss"],
     "TD error": history["td_error"],
     "Mean over the batches of max Q": history["mean_q"],
     "Terminal transitions (%)": 100 * np.array(history["terminal_share"]),
-    "Median age of the batches (episodes)": np.arange(len(steps)) - half,
+    "Median age of the memory (episodes)": median_age(history["steps"]),
 }
 _, axes = plt.subplots(2, 3, figsize=(12, 5.5), layout="constrained", sharex=True)
 for ax, (title, values) in zip(axes.flat, panels.items()):
@@ -374,7 +379,7 @@ for ax, (title, values) in zip(axes.flat, panels.items()):
     ax.grid(alpha=0.3)
 for ax in axes[1]:
     ax.set_xlabel("Episode")
-for k in (50, 100, 200, len(steps) - 1):
+for k in (50, 100, 200, run.solved_at):
     share = history["td_error"][k] / history["mean_q"][k]
     print(f"episode {k}: loss {history['loss'][k]:.2f}, TD error {share:.0%} of the mean of max Q")
 
@@ -418,8 +423,8 @@ print(f"greedy return: mean {returns.mean():.1f}, lowest {returns.min():.0f}, hi
 print(f"mean reward of the last 50 training episodes: {run.rewards[-50:].mean():.1f}")
 
 # %% [markdown]
-# Three policies side by side, from the same start: random pushes, a rule written by hand (push to the side to which
-# the pole leans and moves), and the trained network.
+# Three policies from the same start. From left to right: random pushes, a rule written by hand (push to the side to
+# which the pole leans and moves), and the trained network.
 
 
 # %%
@@ -486,11 +491,12 @@ dqn_keras.animate(dqn_keras.record_episode(picture_env, run.q_network, seed=seed
 # %% [markdown]
 # ## The same, compiled
 #
-# If the environment is written in TensorFlow, too, XLA can compile whole episodes: acting, stepping, remembering and
-# learning are one program. After some seconds of compiling, a training takes about a tenth of a second
-# ([results/speed.md](../results/speed.md)). The algorithm, the networks and the optimizer are the same. The run ends at
-# another episode, because a compiled program draws its random numbers with another generator than NumPy's. (With these
-# numbers, seed 0 is one of the slow ones; [How reliable is it?](how_reliable.ipynb) says how many there are.)
+# If the environment is written in TensorFlow, too, XLA, TensorFlow's compiler, can compile whole episodes: acting,
+# stepping, remembering and learning are one program. After some seconds of compiling, a training takes about a tenth of
+# a second ([results/speed.md](../results/speed.md)). The algorithm, the networks and the optimizer are the same. The
+# run ends at another episode, because a compiled program draws its random numbers with another generator than NumPy's.
+# (With these numbers, seed 0 is one of the slow ones; [How reliable is it?](how_reliable.ipynb) says how many there
+# are.)
 
 # %%
 from dqn_keras.environments import CartPole

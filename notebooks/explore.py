@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Explore
 #
-# Move a number, and see what becomes of eight training runs and of the pole. Each move trains eight new agents. That
-# takes a second or two, because other numbers need no other program. Only a new value of the last slider compiles one,
-# for some seconds.
+# Move a number, and see how eight training runs and the pole change. Each move trains eight new agents, which takes a
+# second or two. Most sliders use the program that is compiled already. Only `steps_per_update` compiles a new one for
+# each new value, which takes some seconds.
 #
 # The sliders need a running notebook and `pip install "dqn_keras[explore]"`. Without them, call the function yourself:
 # `explore(gamma=0.99)`.
@@ -40,13 +40,14 @@ def explore(gamma=0.95, tau=0.01, alpha=0.001, decay=0.995, epsilon_min=0.1, ste
     )
     runs = [train(env, config, seed, verbose=0) for seed in range(8)]
     _, ax = plt.subplots(figsize=(8, 3.5), layout="constrained")
-    for run in runs:
-        ax.plot(run.history["average_reward"], alpha=0.8)
+    for seed, run in enumerate(runs):
+        ax.plot(run.history["average_reward"], alpha=0.8, label=f"seed {seed}")
     ax.axhline(config.solved_reward, color="gray", linestyle=":")
     solved = [run.solved_at for run in runs if run.solved_at is not None]
     median = f", in a median of {np.median(solved):.0f} episodes" if solved else ""
     ax.set(title=f"{len(solved)} of 8 seeds solved{median}", xlim=(0, config.num_episodes), ylim=(0, 260))
     ax.set(xlabel="Episode", ylabel="Mean reward of the last 50")
+    ax.legend(loc="upper left", ncols=2, fontsize="small")
     ax.grid(alpha=0.3)
     plt.show()
     display(animate(record_episode(picture_env, runs[0].q_network, seed=0, max_steps=250)))
@@ -55,7 +56,8 @@ def explore(gamma=0.95, tau=0.01, alpha=0.001, decay=0.995, epsilon_min=0.1, ste
 explore()
 
 # %% [markdown]
-# The curves end where a run is solved. Below them: the greedy policy of seed 0, for at most 250 steps. Some questions:
+# A curve ends where its run is solved. The pole is balanced by the network of seed 0, greedily, for at most 250 steps.
+# Some questions:
 #
 # - Which is the smallest `gamma` with which a seed is solved? The largest?
 # - What does a slow target (`tau` 0.002) do to the curves? And none at all (`tau` 1)?
