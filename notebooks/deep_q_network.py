@@ -8,7 +8,7 @@
 # In this notebook, a small neural network finds out how, by *Q-learning* with the two ideas that made it work with
 # networks: a *replay memory* and a *target network* ([Mnih et al. 2015](https://www.nature.com/articles/nature14236)).
 # Each part is written out in a few lines, and a check compares it with the package `dqn_keras`. Read it, change it, and
-# see what happens. It takes about half an hour to read; [From a table to a network](from_a_table.ipynb) is a gentler
+# see what happens. It takes about an hour to read; [From a table to a network](from_a_table.ipynb) is a gentler
 # start. "S&B" is [Sutton and Barto's book](http://incompleteideas.net/book/the-book-2nd.html), second edition.
 
 # %%
