@@ -63,6 +63,7 @@ SETTINGS: dict[str, Config | dict[str, Any]] = {
     "no target network: tau 1": changed(tau=1.0),
     "hard target: a copy every 125 updates (500 steps)": changed(tau=1.0, gradient_steps_per_target=125),
     "no replay to speak of: memory of 64, the batch": changed(memory_size=64),
+    "neither: tau 1 and a memory of 64": changed(tau=1.0, memory_size=64),
     "memory of 10,000": changed(memory_size=10_000),
     "memory of 1,000,000: nothing is forgotten": changed(memory_size=1_000_000),
     "gamma 0.99": changed(gamma=0.99),
