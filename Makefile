@@ -1,65 +1,85 @@
-# make notebook: run the notebooks end to end.  make test: lint, types, tests and notebooks.  make docs: the site.
+# make notebook: run the notebooks end to end.  make lab: work in them, in JupyterLab.  make test: everything that is checked.
+# make coverage: the share of lines that the tests run.  make docs: the site.
 # make test-lowest: the fast tests with the lowest versions that pyproject.toml allows, and on newer Pythons.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: notebook test test-lowest lint format docs docs-serve clean
+.PHONY: notebook lab test test-lowest coverage lint format docs docs-serve clean
 
-# $(call install,PYTHON,ENVIRONMENT,CONSTRAINTS,EXTRA)
-define install
-$(1) -m venv $(2)
-$(2)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(3) --editable ".[$(4)]"
-touch $(2)/installed
-endef
-
-notebook: .venv/installed
+# Each of these files says that .venv holds one extra of the package.
+notebook: .venv/has-notebooks
 	$(BIN)/python notebooks/render.py
+	@echo
+	@echo "Done. Open notebooks/deep_q_network.ipynb in your editor with the kernel of .venv, or type: make lab"
+
+lab: .venv/has-explore
+	cd notebooks && ../$(BIN)/jupyter lab
+
+.venv/has-notebooks: pyproject.toml constraints.txt
+	@echo "Installing the package and TensorFlow into .venv: 0.7 GB to download, 2.5 GB on disk, some minutes."
+	$(PYTHON) -m venv .venv
+	$(PIP) --editable ".[notebooks]"
+	@touch $@
+
+.venv/has-%: .venv/has-notebooks
+	@echo "Installing what \"$*\" needs into .venv."
+	$(PIP) --quiet --editable ".[$*]"
+	@touch $@
 
 # Each file has its own process, two at a time, the largest first, since what XLA has compiled stays in a process's memory.
 # The tests in a browser are skipped where there is none; `make docs` is what can require it.
 test: lint
 	(echo notebooks; ls -S tests/test_*.py) | REQUIRE_BROWSER= xargs -n 1 -P 2 $(BIN)/python -m pytest --quiet
 
-lint: .venv/installed
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+# Every line of the package that a test runs, and those that none does.
+coverage: .venv/has-dev
+	rm -f .coverage*
+	$(BIN)/coverage run -m pytest --quiet -m "not slow" tests
+	$(BIN)/coverage combine --quiet
+	$(BIN)/coverage report
 
-format: .venv/installed
+lint: .venv/has-dev
+	$(BIN)/pre-commit run --all-files
+
+format: .venv/has-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 # The pages, in site/; any warning is an error. Where there is a Chromium (REQUIRE_BROWSER=1: there must be one), it opens them all.
-docs: .venv/docs-installed
+docs: .venv/has-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	$(BIN)/python docs/check.py
 	$(BIN)/python -m pytest --quiet -m "not slow" tests/test_watch_it_learn.py
 
-docs-serve: .venv/docs-installed
+docs-serve: .venv/has-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs serve
-
-.venv/docs-installed: .venv/installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[docs]"
-	touch $@
-
-.venv/installed: pyproject.toml constraints.txt
-	$(call install,$(PYTHON),.venv,constraints.txt,dev)
 
 # Newer Pythons, where they are installed.
 NEWER := $(shell for version in 3.12 3.13; do python$$version -c "" 2>/dev/null && echo $$version; done)
 
-.PRECIOUS: .venv-%/installed
+.PRECIOUS: .venv-%/has-test
 
 test-lowest: $(addprefix test-on-,lowest $(NEWER))
 
-test-on-%: .venv-%/installed
+test-on-%: .venv-%/has-test
 	.venv-$*/bin/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile tests
 
-.venv-lowest/installed: pyproject.toml constraints-lowest.txt
-	$(call install,$(PYTHON),.venv-lowest,constraints-lowest.txt,test)
+.venv-lowest/has-test: pyproject.toml constraints-lowest.txt
+	$(call install,$(PYTHON),.venv-lowest,constraints-lowest.txt)
 
-.venv-%/installed: pyproject.toml constraints.txt
-	$(call install,python$*,.venv-$*,constraints.txt,test)
+.venv-newest/has-test: pyproject.toml
+	$(call install,$(PYTHON),.venv-newest,/dev/null)
+
+.venv-%/has-test: pyproject.toml constraints.txt
+	$(call install,python$*,.venv-$*,constraints.txt)
+
+# $(call install,PYTHON,ENVIRONMENT,CONSTRAINTS)
+define install
+$(1) -m venv $(2)
+$(2)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(3) --editable ".[test]"
+@touch $(2)/has-test
+endef
 
 clean:
-	rm -rf .venv .venv-* build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-* build dist site *.egg-info .coverage .pytest_cache .mypy_cache .ruff_cache .hypothesis

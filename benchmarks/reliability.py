@@ -46,7 +46,7 @@ def bad_configs(number: int) -> dict[str, Any]:
         refused(*field)
 
     refuse()
-    return {"bad Configs": sum(tried.values()), "fields": len(tried), "not refused by name": 0}
+    return {"bad Configs": sum(tried.values()), "fields": len(tried), "not an error with its name": 0}
 
 
 def kills_with_own_parts(folder: str, num_kills: int) -> dict[str, int]:
@@ -186,7 +186,15 @@ def main() -> None:
             continue
         start = time.perf_counter()
         figures = campaign()
-        bad = ("differing runs", "not noticed", "silent", "not refused by name", "not one warning", "litter", "foreign")
+        bad = (
+            "differing runs",
+            "not noticed",
+            "silent",
+            "not an error with its name",
+            "not one warning",
+            "litter",
+            "foreign",
+        )
         bad += ("nonsense", "refused")
         cells = []
         for name, value in figures.items():

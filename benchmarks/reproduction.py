@@ -25,7 +25,7 @@ WINDOW = Config().solved_window
 
 
 class Outcome(NamedTuple):
-    """What came of one seed."""
+    """The result of one seed."""
 
     seed: int
     solved_at: int | None

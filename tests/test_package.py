@@ -72,3 +72,13 @@ def test_the_lowest_versions_that_are_tested_are_the_lowest_that_are_allowed():
         name, lowest = re.match(r"(\w+)(?:\[.*\])? >=([\d.]+)", requirement).groups()
         version = pinned[name.replace("_", "-")]
         assert version == lowest or re.fullmatch(rf"{re.escape(lowest)}(\.0)+", version), requirement
+
+
+def test_the_page_install_names_every_requirement_but_tensorflow():
+    root = Path(__file__).parent.parent
+    command = re.search(
+        r"^pip install tensorflow-cpu (.*)$", (root / "docs/how_to/install.md").read_text(), re.MULTILINE
+    )
+    named = {re.match(r"[\w-]+", word)[0] for word in command[1].replace('"', "").split()}
+    required = tomllib.loads((root / "pyproject.toml").read_text())["project"]["dependencies"]
+    assert named == {re.match(r"[\w-]+", requirement)[0] for requirement in required} - {"tensorflow"}

@@ -11,20 +11,22 @@ README = (ROOT / "README.md").read_text()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "script",
-    re.findall(r"```python\n(.*?)```", README, re.DOTALL),
-    ids=["train", "own parts", "compiled", "resume", "study", "learn"],
-)
 @pytest.mark.usefixtures("script_folder")
-def test_the_readmes_scripts_run(script):
+def test_the_readmes_script_prints_what_it_says(capsys):
+    [script] = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     exec(compile(script, "README.md", "exec"), {})
-    assert ("plot" in script) == bool(list(Path.cwd().glob("*.png"))), "a script shows its picture, or saves it"
+    said = re.findall(r"print\(.*\)  # (<.*>|[\d.]+)", script)
+    assert len(said) == 2
+    assert without_numbers(capsys.readouterr().out) == without_numbers("\n".join(said) + "\n")
+
+
+def without_numbers(text):
+    return re.sub(r"\d+(\.\d+)?", "#", text)  # those of another machine may differ
 
 
 def test_the_readmes_commands_are_ones():
     commands = re.findall(r"^dqn-keras (.*)$", README, re.MULTILINE)
-    assert len(commands) == 6
+    assert len(commands) == 3
     for command in commands:
         parse(shlex.split(command))
 

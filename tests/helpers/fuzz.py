@@ -229,7 +229,7 @@ POOL: dict[str, Callable[[], Any]] = {
     "two Axes": lambda: plt.subplots(1, 2)[1],
     "a Figure": plt.figure,
 }
-"""Each value is made anew, by name: a shared one could carry what an earlier case did to it."""
+"""Each value is made again, by name: a shared one could carry what an earlier case did to it."""
 
 Claim = Callable[[Any], bool]
 """Returns whether a value, from `POOL`, is right, so that the function must accept it."""
