@@ -262,6 +262,7 @@ def test_a_second_run_is_refused_while_one_writes_in_the_folder(tmp_path):
     assert fingerprint(play("Gymnasium loop", tmp_path, QUICK)) == fingerprint(run)  # and now it is free
 
 
+@pytest.mark.slow
 def test_two_processes_that_start_at_once_leave_one_whole_run(tmp_path):
     figures = faults.race_campaign(tmp_path, 1)
     assert figures["pairs"] == 1

@@ -66,6 +66,7 @@ def test_bad_arguments_are_named(cartpole):
         evaluate(gym.make("Pendulum-v1"), make_q_network(3, 2))
 
 
+@pytest.mark.slow
 def test_greedy_episodes_of_a_functional_environment_replayed_in_gymnasium_agree(cartpole):
     network = train(CartPole(), Config(num_episodes=150), seed=0, verbose=0).q_network
     returns = evaluate(CartPole(), network, 30, seed=4)

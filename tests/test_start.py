@@ -84,6 +84,7 @@ run = train(gym.make("CartPole-v1"), Config(num_episodes=20), seed=0)
 """
 
 
+@pytest.mark.slow
 def test_tensorflow_logs_nothing_between_the_lines_of_train_even_if_keras_was_imported_first():
     process = start(KERAS_FIRST, DQN_KERAS_CACHE="0")
     out, err = process.communicate()
@@ -106,11 +107,13 @@ def flags(first="", is_off=False, **environment):
     return output(start(FLAGS.format(first=first, is_off=is_off), **{"DQN_KERAS_CACHE": "0", **environment})).strip()
 
 
+@pytest.mark.slow
 def test_the_garbage_collector_is_as_it_was():
     assert flags().startswith("True")
     assert flags(is_off=True).startswith("False")
 
 
+@pytest.mark.slow
 def test_what_the_user_chose_stays():
     assert flags() == f"True {OPTION} None"
     assert flags(XLA_FLAGS="--xla_cpu_enable_fast_math=false") == f"True --xla_cpu_enable_fast_math=false {OPTION} None"
@@ -121,6 +124,7 @@ def test_what_the_user_chose_stays():
     assert flags(TF_XLA_FLAGS=chosen, DQN_KERAS_CACHE="1") == f"True {OPTION} {chosen}"
 
 
+@pytest.mark.slow
 def test_a_process_does_not_use_the_folder_of_its_parent(tmp_path):
     parents = f"--tf_xla_persistent_cache_directory={tmp_path}/xla-0/process-abc"
     assert flags(TF_XLA_FLAGS=f"--tf_xla_auto_jit=0 {parents}") == f"True {OPTION} --tf_xla_auto_jit=0"
@@ -131,6 +135,7 @@ def test_a_process_does_not_use_the_folder_of_its_parent(tmp_path):
     assert not list(tmp_path.glob("*/process-*"))
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_used_is_no_error(tmp_path):
     (tmp_path / "a file").touch()
     (tmp_path / "file").touch()

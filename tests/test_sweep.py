@@ -83,6 +83,7 @@ def test_ray_makes_the_same_sweep():
     assert digests(by_ray) == digests(sweep(CartPole(), SETTINGS, range(2), num_workers=1, verbose=0))
 
 
+@pytest.mark.slow
 def test_a_sweep_continues_in_its_file_with_more_seeds_and_more_settings(tmp_path, monkeypatch):
     done, train_seed = [], workers._train_seed
     monkeypatch.setattr(workers, "_train_seed", lambda setting, seed: done.append(seed) or train_seed(setting, seed))
