@@ -1,5 +1,7 @@
 import re
 import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -38,3 +40,12 @@ def test_the_readmes_links_and_map_name_what_is_there():
         assert module.name in README or module.name in {"version.py"}, module.name
     for folder in (ROOT / "dqn_keras").glob("*/__init__.py"):
         assert f"  {folder.parent.name}/" in README, folder
+
+
+@pytest.mark.skipif(not shutil.which("make"), reason="there is no make")
+@pytest.mark.parametrize("path", ["README.md", "CONTRIBUTING.md", ".ci/run", ".github/workflows/tests.yml"])
+def test_make_knows_each_target_that_is_named(path):
+    text = re.sub(r"\$\{\{.*?\}\}", "lowest", (ROOT / path).read_text())
+    targets = set(re.findall(r"(?:`|^|run: )make ([\w.][\w./-]*)", text, re.MULTILINE))
+    assert targets
+    subprocess.run(["make", "--dry-run", *targets], cwd=ROOT, check=True, capture_output=True)
