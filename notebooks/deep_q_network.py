@@ -332,8 +332,8 @@ _ = ax.axhline(config.solved_reward, color="gray", linestyle=":")
 #
 # The original notebook reports its run as solved in 293 episodes. That is one seed, and so is this one.
 #
-# `train` also takes your formula for the targets. With the same formula, it is the same run. Change `my_targets` above,
-# and this cell shows what happens.
+# `train` also takes your formula for the targets. With the same formula, it is the same run. Now change `my_targets`
+# above, run its cell (its check then fails) and the next cell, and see what happens.
 
 # %%
 own_run = train(env, config, seed, targets=my_targets, verbose=0)

@@ -67,7 +67,7 @@ def answer(value, what):
 
 
 def check(number):
-    """Runs a check at once, and prints how the exercise stands."""
+    """Runs a check at once, and prints its result."""
 
     def run(test):
         solved.discard(number)
@@ -113,7 +113,7 @@ def compiles(function, *tensors):
 
 
 def compare_targets(y, right, mistakes):
-    """Fails if y is wrong; the message names the mistake, if it is one of those that are known by their result."""
+    """Fails if y is wrong; the message names the mistake, if it is one of the known `mistakes`."""
     y = np.asarray(y)
     wanted = "they must have shape (6,), one target for each of the six transitions"
     assert y.shape == (6,), f"your targets have shape {y.shape}; {wanted}"
@@ -420,9 +420,9 @@ for correlation in (0.0, 0.5, 1.0):
     print(f"correlation {correlation}: maximum {first.max(axis=1).mean():.2f}, valued by the second {of_second:.2f}")
 
 # %% [markdown]
-# The maximum says more than 1 where 0 is right. If one set of values *chooses* the action and an independent set
-# *values* it, the error is gone. The more the two are alike, the more error stays. Double DQN uses this: $Q$ chooses
-# the action, $\hat Q$ values it.
+# The maximum is more than 1 on average, where 0 is right. If one set of values *chooses* the action and an independent
+# set *values* it, the error is gone. The more the two are alike, the more error stays. Double DQN uses this: $Q$
+# chooses the action, $\hat Q$ values it.
 #
 # $$y = r + (1 - \text{terminal}) \, \gamma \, \hat Q\bigl(s', \arg\max_{a'} Q(s', a')\bigr)$$
 #
@@ -491,7 +491,7 @@ def _():
 
 # %% tags=["student"]
 class TimeLimitIsTerminal(gym.Wrapper):
-    """Says `terminated` where the environment says `truncated`."""
+    """Reports `terminated` where the environment reports `truncated`."""
 
     def step(self, action):
         """Returns observation, reward, terminated, truncated, info."""
@@ -500,7 +500,7 @@ class TimeLimitIsTerminal(gym.Wrapper):
 
 # %% tags=["solution"]
 class TimeLimitIsTerminal(gym.Wrapper):
-    """Says `terminated` where the environment says `truncated`."""
+    """Reports `terminated` where the environment reports `truncated`."""
 
     def step(self, action):
         """Returns observation, reward, terminated, truncated, info."""
@@ -603,8 +603,9 @@ def _():
     q_of_run = q_function(run.q_network)
     claim, rewards = q_of_run(state).max(), play(q_of_run, state)[0]
     measured = discounted_return(rewards, run.config.gamma)
-    assert abs(claim - measured) > 3, f"Q says {claim:.1f} and {measured:.1f} is measured: not far enough apart"
-    return f"Q says {claim:.1f}, but the episode lasts {len(rewards)} steps, whose discounted return is {measured:.1f}."
+    found = f"Q is {claim:.1f}, and the measured return is {measured:.1f}"
+    assert abs(claim - measured) > 3, f"{found}: they must differ by more than 3"
+    return f"Q is {claim:.1f}, but the episode lasts {len(rewards)} steps: its discounted return is {measured:.1f}."
 
 
 # %% [markdown]
@@ -624,7 +625,7 @@ if 6 in solved:
         ax.plot([0, 20], [0, 20], color="gray", linestyle=":")
         error = np.abs(claims - measured).mean()
         ax.set(title=f"States {name}: mean error {error:.1f}", xlabel="Measured discounted return")
-    axes[0].set_ylabel("What Q says: its highest value")
+    axes[0].set_ylabel("Claim: max over a of Q(s, a)")
     plt.show()
 
 # %% [markdown] tags=["solution"]
@@ -817,7 +818,7 @@ presets["CartPole-v1"]
 
 # %%
 class Probe(NamedTuple):
-    """A tiny environment, and what is right in it."""
+    """A tiny environment with its right Q-values."""
 
     starts: list  # the first observation of an episode is one of these
     steps: dict  # (observation, action): (reward, next observation, or None at the end)
@@ -880,12 +881,12 @@ def run_probe(probe, targets=td_targets, choose=action, remember=Experience):
             return f"Q of observation {observation}, action {a} is {q[observation][a]:.2f}, right is {right}"
     values = {observation: [probe.q[observation, a] for a in range(num_actions)] for observation in observations}
     best = [values[o][a] == max(values[o]) for o, a in taken[-400:] if max(values[o]) > min(values[o])]
-    if best and np.mean(best) < 0.8:  # right are the greedy actions, 80 %, and half of the random ones: 90 % together
+    if best and np.mean(best) < 0.8:  # epsilon 0.2 and two actions: 90 % are the best one
         return f"the Q-values are right, but only {np.mean(best):.0%} of its actions are"
     return ""
 
 
-print("a sound agent:", [run_probe(probe) or "passes" for probe in probes.values()])
+print("an agent without a mistake:", [run_probe(probe) or "passes" for probe in probes.values()])
 
 # %% [markdown]
 # The next cell has five agents, A to E, each with one mistake in one part. Do not read it yet. Run it, look at its

@@ -24,7 +24,7 @@ import numpy as np
 # step 0. Goal and holes are *terminal*: there the *episode* is over. It also ends after 100 steps.
 
 # %%
-env = gym.make("FrozenLake-v1", is_slippery=False)  # a step goes where it is meant to go
+env = gym.make("FrozenLake-v1", is_slippery=False)  # each step goes in the chosen direction
 field = env.unwrapped.desc.astype(str)  # [4, 4] letters
 print("\n".join(" ".join(row) for row in field))
 
@@ -56,7 +56,7 @@ def q_learning(env, num_episodes, seed=0, alpha=alpha):
     for episode in range(num_episodes):
         (s, _), is_over = env.reset(seed=seed if episode == 0 else None), False
         while not is_over:
-            best = rng.choice(np.flatnonzero(q[s] == q[s].max()))  # of equal ones, any
+            best = rng.choice(np.flatnonzero(q[s] == q[s].max()))  # if several are highest, a random one of them
             a = int(rng.integers(4)) if rng.random() < epsilon else int(best)
             next_s, r, terminated, truncated, _ = env.step(a)
             y = r + (1 - terminated) * gamma * q[next_s].max()

@@ -32,7 +32,7 @@ from dqn_keras import Config, animate, evaluate, plot_run, record_episode, train
 
 # %%
 class Catch(gym.Env):
-    """Catch falling balls with a paddle; a reward of 1 for each, until the first is missed."""
+    """A paddle that catches falling balls: a reward of 1 for each ball, until one is missed."""
 
     observation_space = gym.spaces.Box(-1.0, 1.0, (5,), np.float32)  # see _observation
     action_space = gym.spaces.Discrete(3)  # left, stay, right
@@ -96,7 +96,7 @@ gym.register("Catch-v0", entry_point=Catch, max_episode_steps=250)
 env = gym.make("Catch-v0")
 
 # %% [markdown]
-# ## Does it keep its word?
+# ## Does it follow the interface?
 #
 # Gymnasium's checker tries every method. Are the observations in the space? Are the types right? Does the same seed
 # give the same episode? Does it render? The checker prints nothing if all is well.
@@ -115,7 +115,7 @@ config = Config(num_episodes=1_000, solved_reward=9)
 run = train(env, config, seed=0)
 
 # %% [markdown]
-# ## What has happened
+# ## What happened in training
 #
 # The upper panel shows the rewards, the lower ones what to look at if they do not rise. The Q-values stay under their
 # bound: with the highest reward at every step, the return would be $r_{max} / (1 - \gamma) = 20$, and one ball in 25

@@ -163,6 +163,7 @@ RIGHT_WEIGHTS = [0.9**100, 0.95**100, 0.99**100]
         (6, SUM.format([0, 0, 0]) + RIGHT_SUM, "a state is four numbers"),
         (6, SUM.format([2.5, 0, 0, 0]) + RIGHT_SUM, "the episode is over"),
         (6, SUM.format([0, 0, 0, 9]) + RIGHT_SUM, "stay within"),
+        (6, SUM.format([0, 0, 0.2, 3]) + RIGHT_SUM, "they must differ by more than 3"),
         (6, SUM.format([0, 0, 0, 0]) + RIGHT_SUM, ": solved."),
         (7, PENALTY.format(body="pass"), "reward returns nothing"),
         (7, PENALTY.format(body="return tf.where(self.terminal(state, rng), -1.0, 1.0)"), "next_state has fallen"),
