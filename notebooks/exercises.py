@@ -244,7 +244,7 @@ if 1 in solved:
 # $\hat Q$ equals $Q$ at all times: there is no target network any more.
 #
 # A run is *late* if it is not solved by episode 500. **Predict first**: without a target network, will more seeds be
-# late, as many, or fewer? Set `prediction` to one of the three words.
+# late, as many, or fewer? Set `prediction` to `"more"`, `"as many"` or `"fewer"`.
 
 # %% tags=["student"]
 prediction = None  # your code here: "more", "as many" or "fewer"
@@ -762,9 +762,9 @@ if 8 in solved:
         print(f"gamma {gamma}: {np.mean(lengths):.0f} steps; ends: {counts}; cart {np.mean(sides):.2f} from the middle")
 
 # %% [markdown] tags=["solution"]
-# **What it shows.** With $\gamma = 0.9$ the pole does not fall: after some hundred steps, the cart leaves the track.
-# With a larger $\gamma$, fewer episodes end at the edge, and they last longer. Only $\gamma$ was changed, so it is a
-# cause of both.
+# **What it shows.** With $\gamma = 0.9$ the pole does not fall. Most episodes end after some hundred steps, when the
+# cart leaves the track. With a larger $\gamma$, fewer episodes end at the edge, and they last longer. Only $\gamma$ was
+# changed, so it is a cause of both.
 
 # %% [markdown]
 # ## 9. Solve it properly (30 minutes)
