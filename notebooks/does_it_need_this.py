@@ -1,13 +1,14 @@
 # %% [markdown]
 # # Does it need this?
 #
-# DQN is Q-learning with a network, and a list of additions: a replay memory, a target network, Double DQN, a Huber
-# loss, clipped gradients, other numbers. Which of them matter here? We take one away, or add one, and train a hundred
-# seeds each. Compiled episodes make that a matter of a few minutes.
+# DQN is Q-learning with a network and two additions: a replay memory and a target network. Others have added more:
+# Double DQN, a Huber loss, clipped gradients, other numbers. Which of them matter here? We take one away, or add one,
+# and train a hundred seeds each. With compiled episodes, that takes a few minutes.
 #
-# Reading takes ten minutes. The lesson ([deep_q_network.ipynb](deep_q_network.ipynb)) explains most of the parts.
-# *Double DQN* lets $Q$ choose the next action and $\hat Q$ value it. The *Huber loss* is the squared error for errors
-# below 1, and grows in a straight line above. *Clipping* shortens a gradient whose length (norm) is above 1.
+# Reading takes about ten minutes. The lesson ([deep_q_network.ipynb](deep_q_network.ipynb)) explains the replay memory,
+# the target network and the numbers. *Double DQN* lets $Q$ choose the next action and $\hat Q$ value it. The *Huber
+# loss* is quadratic for errors below 1, and grows in a straight line above. *Clipping* shortens a gradient whose length
+# (norm) is above 1.
 
 # %%
 import os
@@ -25,8 +26,8 @@ original
 # %% [markdown]
 # ## The settings
 #
-# Each differs from the original in what its name says. A run ends when the mean of the last 50 rewards is above 225,
-# which counts as solved, or after 500 episodes.
+# Each setting differs from the original in what its name says. A run ends when the mean of the last 50 rewards is above
+# 225, which counts as *solved*, or after 500 episodes.
 
 # %%
 import keras
@@ -49,14 +50,14 @@ settings = {
 }
 
 # %% [markdown]
-# "No target network" means $\tau = 1$: after each update, $\hat Q$ is $Q$. "No replay" is a memory that holds only the
-# last 64 transitions, which is one batch: each update learns from exactly the last 64 steps. (The recommended numbers
-# are those of the preset for CartPole, with the original's bar of 225.)
+# "No target network" means $\tau = 1$: after each update, $\hat Q$ equals $Q$. "No replay" is a memory of only 64
+# transitions, which is one batch: each update learns from the last 64 steps. "Recommended" takes the numbers that the
+# package recommends for CartPole (`presets["CartPole-v1"]`), with the original's bar of 225.
 #
 # ## Predict
 #
-# How many of a hundred seeds will be solved by episode 500? Write down your numbers before you go on. For the original,
-# the README says about 90.
+# How many of a hundred seeds will be solved by episode 500? Replace each `None` by a number before you go on. For the
+# original, the README says about 90.
 
 # %%
 prediction = {
@@ -79,7 +80,17 @@ outcome = sweep(CartPole(), settings, seeds=range(100), evaluate_on=CartPole(), 
 Markdown(sweep_table(outcome))
 
 # %% [markdown]
-# "Late or never" means: not solved by episode 500, where these runs end. A median of 500 means 500 or more.
+# How to read the table:
+#
+# - *Solved* is the share of seeds that are solved by episode 500. That is what you predicted.
+# - *Late or never* is the rest, since these runs end at episode 500.
+# - *Median episodes*: half of the seeds are solved earlier. Seeds that are not solved count as 500, so a median of 500
+#   means 500 or more.
+# - *Greedy return* is the mean reward of 100 episodes after training, without random actions.
+# - In brackets are *95 % intervals*: other seeds would give other numbers, and the interval says where the number for
+#   all seeds probably lies.
+#
+# The picture shows the same. Its left panel is *late or never*: 100 % minus the share that you predicted.
 
 # %% tags=["save-does_it_need_this"]
 axes = plot_sweep(outcome)
@@ -95,22 +106,21 @@ for name, study in outcome.items():
 # %% [markdown]
 # ## What it shows
 #
-# In brackets are 95 % intervals. Where two of them overlap widely, a hundred seeds do not settle which setting is
-# better.
+# Where two intervals overlap widely, a hundred seeds do not show which setting is better.
 #
-# - **No target network**: the result plays better, and the median is lower. On this task, the slow copy is no help.
-#   (More seeds are solved, too: over 500 seeds, that difference is clear,
+# - **No target network**: the trained networks play better, and the median is lower. On this task, the slow copy is no
+#   help. (More seeds are solved, too: over 500 seeds, that difference is clear,
 #   [results/ablation.md](../results/ablation.md).)
-# - **No replay**: three of four seeds are not solved within 500 episodes. It looks as if replay were the part that
-#   matters most.
-# - **Neither**: but without both, nine of ten seeds are solved in time. So it is the slow target that cannot do without
-#   replay. Without it, replay still helps: compare the medians of "no target network" and "neither". The effect of one
-#   part depends on the others, so test them together, too.
+# - **No replay**: three of four seeds are not solved by episode 500. Replay seems to be the part that matters most.
+# - **Neither**: but without both parts, nine of ten seeds are solved. So it is the slow target that needs replay.
+#   Without a slow target, replay still helps: compare the medians of "no target network" and "neither". The effect of
+#   one part depends on the others, so test them together, too.
 # - **Double DQN**: no difference is shown.
-# - **Huber loss and clipped gradients**: with Huber, hardly a seed is solved in time. (Given 2,000 episodes, three of
-#   four are: [results/ablation.md](../results/ablation.md).) With clipping, the result plays worse.
+# - **Huber loss**: hardly a seed is solved. (With 2,000 episodes, three of four are:
+#   [results/ablation.md](../results/ablation.md).)
+# - **Clipped gradients**: the trained networks play worse.
 # - **Gamma 0.99**: the median and the greedy return are close to the original's.
-# - **Recommended**: it plays better after training than the original, though it is solved a little later.
+# - **Recommended**: the trained networks play better than the original's, but the median is a little higher.
 #
 # All this holds for CartPole, a network with one hidden layer, and the original's other numbers. Change one of them and
 # ask again.

@@ -1,12 +1,11 @@
 # %% [markdown]
 # # Explore
 #
-# Move a number, and see how eight training runs and the pole change. Each move trains eight new agents, which takes a
-# second or two. Most sliders use the program that is compiled already. Only `steps_per_update` compiles a new one for
-# each new value, which takes some seconds.
+# Move a slider, and see how eight training runs and the pole change. Each move trains eight new agents, which takes a
+# second or two. Only a new value of `steps_per_update` takes some seconds more, because it compiles a new program.
 #
 # The sliders need a running notebook and `pip install "dqn_keras[explore]"`. Without them, call the function yourself:
-# `explore(gamma=0.99)`.
+# `explore(gamma=0.99)`. The lesson ([deep_q_network.ipynb](deep_q_network.ipynb)) explains the parameters.
 
 # %%
 import os
@@ -56,12 +55,12 @@ def explore(gamma=0.95, tau=0.01, alpha=0.001, decay=0.995, epsilon_min=0.1, ste
 explore()
 
 # %% [markdown]
-# A curve ends where its run is solved. The pole is balanced by the network of seed 0, greedily, for at most 250 steps.
-# Some questions:
+# A curve ends where its run is solved, or after 500 episodes. The pole is balanced by the network of seed 0, without
+# random actions, for at most 250 steps. Some questions:
 #
-# - Which is the smallest `gamma` with which a seed is solved? The largest?
-# - What does a slow target (`tau` 0.002) do to the curves? And none at all (`tau` 1)?
-# - With which `alpha` do the seeds fail? Do they fail in the same way at both ends?
+# - What is the smallest `gamma` with which a seed is solved? And the largest?
+# - What does a slow target network (`tau` 0.002) do to the curves? And what if there is none (`tau` 1)?
+# - With which values of `alpha` do the seeds fail? Do they fail in the same way with low and with high values?
 # - What if exploration ends early (`decay` 0.95)? What if it hardly ends (`epsilon_min` 0.5)?
 
 # %% tags=["sliders"]

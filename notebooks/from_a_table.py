@@ -1,9 +1,9 @@
 # %% [markdown]
 # # From a table to a network
 #
-# A DQN is Q-learning with a network where there used to be a table. This notebook begins with the table, which one can
-# see filling. Then it makes the same step with a network, and gets the same numbers. Then it gives the network a
-# hidden layer, and something new happens. It takes about twenty minutes to read. The first half needs only Python and
+# A DQN (Deep Q-Network) is Q-learning with a network in place of a table. This notebook begins with the table, and
+# shows how it fills. Then it takes the same steps with a network, and gets the same numbers. Then it gives the network
+# a hidden layer, and something new happens. Reading takes about twenty minutes. The first half needs only Python and
 # NumPy; the second half uses Keras.
 
 # %%
@@ -15,38 +15,35 @@ import gymnasium as gym
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dqn_keras import make_q_network, td_targets
-
-import keras  # isort: skip  (after dqn_keras, which keeps TensorFlow from logging)
-
 # %% [markdown]
 # ## A lake
 #
-# [FrozenLake](https://gymnasium.farama.org/environments/toy_text/frozen_lake/): a field of 4 × 4 cells. **S** is the
-# start, **G** the goal, **H** a hole. In each *state* (a cell, 0 to 15) there are four *actions*: left (0), down (1),
-# right (2), up (3). A step to the goal gives a *reward* of 1, every other step 0. Goal and holes are *terminal*: the
-# *episode* is over. After 100 steps time is up.
+# [FrozenLake](https://gymnasium.farama.org/environments/toy_text/frozen_lake/) is a field of 4 × 4 cells. **S** is the
+# start, **G** the goal, **H** a hole, **F** is frozen and safe. A *state* is a cell, 0 to 15, row by row. In each state
+# there are four *actions*: left (0), down (1), right (2), up (3). A step to the goal gives a *reward* of 1, every other
+# step 0. Goal and holes are *terminal*: there the *episode* is over. It also ends after 100 steps.
 
 # %%
-env = gym.make("FrozenLake-v1", is_slippery=False)  # a step goes where it is meant to go
+env = gym.make("FrozenLake-v1", is_slippery=False)  # each step goes in the chosen direction
 field = env.unwrapped.desc.astype(str)  # [4, 4] letters
 print("\n".join(" ".join(row) for row in field))
 
 # %% [markdown]
 # ## The table
 #
-# $Q(s, a)$ is what one can expect after action $a$ in state $s$: the sum of all later rewards, where a reward counts
-# less the later it comes, by a factor $\gamma$ for each step. There are 16 states and 4 actions, so all of $Q$ is a
-# table of 64 numbers. At the beginning all are 0.
+# $Q(s, a)$ is what one can expect after action $a$ in state $s$, if the best actions follow: the sum of all later
+# rewards. A later reward counts less, by a factor $\gamma$ for each step. There are 16 states and 4 actions, so $Q$ is
+# a table of 64 numbers. At the beginning all are 0.
 #
-# Each step $(s, a, r, s')$ gives a better guess of one of them: the reward, plus what the table says about the state
-# that follows. If $s'$ is terminal, nothing follows.
+# Each step gives a better guess of one of them. The step leads from state $s$ with action $a$ to state $s'$ and gives
+# the reward $r$. The guess is the reward, plus the discounted value that the table gives to $s'$. If $s'$ is terminal,
+# nothing follows, and the guess is $r$ alone.
 #
 # $$y = r + \gamma \max_{a'} Q(s', a') \qquad\qquad Q(s, a) \leftarrow Q(s, a) + \alpha \, \bigl(y - Q(s, a)\bigr)$$
 #
-# $y$ is the *target*; $\alpha$ says how far the old number moves towards it. To see all actions, the agent takes a
-# random one with probability $\varepsilon$; otherwise the one with the highest number. That is all of **Q-learning**
-# ([Watkins and Dayan 1992](https://link.springer.com/article/10.1007/BF00992698)):
+# $y$ is the *target*; $\alpha$ says how far the old number moves towards it. To try all actions, the agent takes a
+# random one with probability $\varepsilon$; otherwise it takes the one with the highest number. That is all of
+# **Q-learning** ([Watkins and Dayan 1992](https://link.springer.com/article/10.1007/BF00992698)):
 
 # %%
 gamma, alpha, epsilon = 0.9, 0.5, 0.5
@@ -59,7 +56,7 @@ def q_learning(env, num_episodes, seed=0, alpha=alpha):
     for episode in range(num_episodes):
         (s, _), is_over = env.reset(seed=seed if episode == 0 else None), False
         while not is_over:
-            best = rng.choice(np.flatnonzero(q[s] == q[s].max()))  # of equal ones, any
+            best = rng.choice(np.flatnonzero(q[s] == q[s].max()))  # if several are highest, a random one of them
             a = int(rng.integers(4)) if rng.random() < epsilon else int(best)
             next_s, r, terminated, truncated, _ = env.step(a)
             y = r + (1 - terminated) * gamma * q[next_s].max()
@@ -69,8 +66,8 @@ def q_learning(env, num_episodes, seed=0, alpha=alpha):
 
 
 # %% [markdown]
-# Here is the table after 0, 120, 240, 260 and 1,000 episodes. Each cell shows its highest Q-value, darker if it is
-# higher, and an arrow for the action that has it (none while all four are equal).
+# Here is the table after 0, 120, 240, 260 and 1,000 episodes. Each cell shows its highest Q-value (the higher, the
+# darker), and an arrow for the action that has it (no arrow while all four are equal).
 
 
 # %% tags=["folded"]
@@ -107,7 +104,7 @@ print("the goal is reached for the first time in episode", next(n for n, q in en
 # %% [markdown]
 # For a long time there is nothing to learn from: the agent finds the goal by chance alone. Then the values spread from
 # the goal backwards, since a cell can only learn from the cells that follow it. In the end they say how far the goal
-# is: a cell from which it is reached in $k$ steps has the value $\gamma^{k-1}$. The start needs six steps, and has
+# is: a cell that is $k$ steps away from it has the value $\gamma^{k-1}$. The start is six steps away. Its value:
 
 # %%
 q = tables[-1]
@@ -115,9 +112,9 @@ print(f"{q[0].max():.4f}, and 0.9^5 = {0.9**5:.4f}")
 assert np.isclose(q[0].max(), 0.9**5)
 
 # %% [markdown]
-# *A remark.* Usually the ice is slippery: a step goes where it is meant to go in one of three cases, and sideways
-# otherwise. So the same action gives another target each time. How often does the table reach the goal, if it always
-# takes its best action? Two values of $\alpha$, three seeds each:
+# *A remark.* By default, FrozenLake's ice is slippery: one step of three goes where it is meant to go, the others go
+# sideways. So the same action gives different targets. How often does the agent reach the goal, if it always takes the
+# best action of the table? Here are two values of $\alpha$, with three seeds each:
 
 
 # %%
@@ -139,22 +136,28 @@ for name, lake, step in (("firm ice", env, 0.5), ("slippery ice", slippery, 0.5)
     print(f"{name}, alpha {step}: the goal is reached in {shares} of 500 episodes")
 
 # %% [markdown]
-# On slippery ice, the table with the smaller step plays better with each of these seeds.
+# On slippery ice, the smaller $\alpha$ plays better with each of these seeds.
 
 # %% [markdown]
 # ## The same with a network
 #
-# A table with 16 rows is also a network. Give it the state as 16 numbers, a 1 at the place of the cell and 0
-# everywhere else (*one-hot*). A layer `Dense(4)` without bias multiplies this with its kernel [16, 4], and so picks
-# out one row: the kernel *is* the table.
+# A table with 16 rows is also a network. Give it the state as 16 numbers: a 1 at the place of the cell, and 0
+# everywhere else (*one-hot*). A layer `Dense(4)` without bias multiplies this by its kernel [16, 4], and so picks out
+# one row: the kernel *is* the table.
 #
-# Then one step of gradient descent on the squared error $(y - Q(s, a))^2$ is the update above. Its derivative with
-# respect to $Q(s, a)$ is $-2 \, (y - Q(s, a))$, and for all other numbers it is 0. So the learning rate is
-# $\alpha / 2$. ($y$ counts as a fixed number, although $Q$ is in it.) The targets are the package's `td_targets`. It
-# asks for two networks; here, both are the same.
+# Then the update above is one step of gradient descent on the squared error $(y - Q(s, a))^2$. The derivative with
+# respect to $Q(s, a)$ is $-2 \, (y - Q(s, a))$; with respect to all other numbers of the table it is 0. So the learning
+# rate is $\alpha / 2$. ($y$ counts as a fixed number, although $Q$ is in it.)
+#
+# From here on, $y$ comes from the package's function `td_targets`. Its arguments are a batch of steps, $\gamma$, and
+# two networks: $Q$, and $\hat Q$, which gives the values of the next states. Here, both are the same network. The end
+# of this notebook shows what a second one is good for. `make_q_network` makes a network with hidden layers.
 
 # %%
-import tensorflow as tf
+from dqn_keras import make_q_network, td_targets
+
+import keras  # isort: skip  (after dqn_keras, which keeps TensorFlow from logging)
+import tensorflow as tf  # isort: skip
 
 
 def one_hot(s):
@@ -183,7 +186,7 @@ def update(q_network, optimizer, s, a, y):
 
 
 # %% [markdown]
-# Both learn from the same 500 steps, one after the other: random actions in random cells.
+# Table and network learn from the same 500 steps: random actions in random cells.
 
 
 # %%
@@ -209,13 +212,14 @@ print(f"{table.size} numbers, {np.sum(table != 0)} of them not 0, {np.sum(kernel
 np.testing.assert_array_equal(kernel, table)
 
 # %% [markdown]
-# Not one bit is different. So the algorithm is the same. This network is just a slower table.
+# No number is different. So the algorithm is the same: this network is just a slower table.
 #
 # ## A hidden layer
 #
-# A table for CartPole would have a row for each state, and a state there is four real numbers: hardly one ever comes
-# back. A network with a hidden layer can tell something about states that it has never seen, because **states share
-# weights**. The price: an update of one state changes others. The same step ten times, from cell 14 to the goal:
+# In CartPole, the task of the lesson, a state is four real numbers. A table would need a row for each state, and hardly
+# a state comes twice. A network with a hidden layer gives values also for states that it has never seen, because
+# **states share weights**. The price: an update of one state changes the values of others. Here both networks learn the
+# step from cell 14 to the goal, ten times:
 
 
 # %%
@@ -238,10 +242,10 @@ for name, network, optimizer in (("no hidden layer", linear, sgd), ("a hidden la
     print(f"{np.sum(others != 0)} of the other 63 numbers change, at most by {np.abs(others).max():.3f}")
 
 # %% [markdown]
-# Two difficulties follow, which a table does not have.
+# This causes two difficulties that a table does not have.
 #
-# **The order matters.** We take the right answers for all 64 numbers, each 50 times, and teach them to new networks:
-# cell after cell, as to an agent that stays for long in one part of the lake; and the same ones shuffled.
+# **The order matters.** We teach the right values of all 64 numbers to new networks, each value 50 times: first cell
+# after cell, as an agent would meet them that stays long in one part of the lake; then the same values shuffled.
 
 # %%
 right = np.zeros((16, 4), np.float32)
@@ -262,6 +266,8 @@ for name, make, pairs in (
     print(f"{name}: mean error {error.mean():.3f}; in the last cell {error[15]:.3f}, in the worst {error.max():.3f}")
 
 # %% [markdown]
+# With a hidden layer, the order decides: cell after cell, the network learns the last cell and forgets others.
+#
 # **The target moves.** The target of the step from cell 13 to cell 14 is $\gamma \max_{a'} Q(14, a')$. Twenty updates
 # move $Q(13, \text{right})$ towards it, and nothing else is learned. Does the target stay where it was?
 
@@ -293,8 +299,9 @@ show_targets("a hidden layer and Q-hat", other, frozen, 0.1)
 
 # %% [markdown]
 # With a hidden layer, the target has moved along, to 1.121. That is too high: the right value is 0.9, and no value here
-# can be above 1. In the last two lines, the target comes from a copy of the network that stays as it was.
+# can be above 1. In the last two lines, the target comes from $\hat Q$, a copy of the network that stays as it was:
+# this target does not move.
 #
-# So much for what is new with a network. The two ideas that DQN adds to Q-learning answer just this: a **replay
-# memory**, from which the steps are drawn in random order, and a **target network**, the copy. The lesson,
-# [deep_q_network.ipynb](deep_q_network.ipynb), builds both, for a task with too many states for a table.
+# DQN adds two ideas to Q-learning, one for each difficulty: a **replay memory**, from which the steps are drawn in
+# random order, and a **target network**, the copy. The lesson, [deep_q_network.ipynb](deep_q_network.ipynb), builds
+# both, for a task with too many states for a table.

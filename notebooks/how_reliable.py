@@ -1,11 +1,11 @@
 # %% [markdown]
 # # How reliable is it?
 #
-# The main notebook trains one agent, and so did the original: *solved in 293 episodes*. One run is an anecdote. What
-# a reader wants to know is what *their* run will do: how often it works, how long it takes, and what it looks like when
-# it goes wrong. This notebook asks a hundred seeds. Each is the same program with other random numbers: other initial
-# weights, other explorations, other batches, other starts. Then it looks for what makes some of them fail, by changing
-# one thing at a time.
+# The lesson ([deep_q_network.ipynb](deep_q_network.ipynb)) trains one agent, and so did the original: *solved in 293
+# episodes*. One run is an anecdote. You want to know what *your* run will do: how often it works, how long it takes,
+# and what it looks like when it goes wrong. This notebook trains a hundred seeds. Each seed is the same program with
+# other random numbers: other initial weights, random actions, batches and starts. Then it looks for what makes some of
+# them fail, by changing one thing at a time.
 
 # %%
 import dataclasses
@@ -26,9 +26,10 @@ seeds = range(100)
 # %% [markdown]
 # ## A hundred seeds
 #
-# `study` trains one agent for each seed, on all cores. The environment is the functional CartPole, whose episodes are
-# compiled, so that the cell takes seconds; the algorithm is that of the main notebook. Every agent trains until the
-# mean of its last 50 rewards is above 225, or 2,000 episodes are over. Then it plays 100 episodes greedily.
+# `study` trains one agent for each seed, on all cores. The algorithm is the lesson's. The environment is CartPole
+# written in TensorFlow: its episodes are compiled, so the cell takes seconds. Every agent trains until the mean of its
+# last 50 rewards is above 225, or 2,000 episodes are over. Then it plays 100 episodes greedily: it always takes the
+# action with the highest value.
 
 # %%
 outcome = study(CartPole(), config, seeds, evaluate_on=CartPole(), verbose=0)  # verbose=1 shows a progress bar
@@ -38,14 +39,16 @@ outcome
 axes = plot_study(outcome)
 
 # %% [markdown]
-# Left: every seed, faint, and the median with the middle half of the seeds. All begin alike; then the curves rise
-# within a hundred episodes of each other, and most cross the line. A few stop rising just below it.
+# Left: every seed (faint), the median, and the middle half of the seeds. All begin alike; then the curves rise within a
+# hundred episodes of each other, and most cross the dotted line of 225. A few stop rising just below it.
 #
-# Middle: when they crossed it. The published 293 is an ordinary number among those. Right: the share of seeds that are
-# solved, by episode. It climbs steeply, and then it bends: **some seeds are not slow, they are of another kind**.
+# Middle: when the seeds cross the line. The published 293 is an ordinary number among them. Right: the share of seeds
+# solved by episode. It climbs steeply, and then it bends: **some seeds are not slow, they are of another kind**.
 #
-# In numbers, with 95 % intervals (bootstrap; Wilson's for shares). A seed that was not solved counts with the 2,000
-# episodes that it had, which moves a mean but not a median. *Late* is a seed that is solved after episode 500.
+# Here are the numbers. A seed is *late* if it is solved after episode 500. A seed that is not solved counts as 2,000
+# episodes; that changes a mean, but not the median, as long as most seeds are solved. In brackets are *95 % intervals*:
+# other seeds would give other numbers, and the interval says where the number for all seeds probably lies. (Methods:
+# Wilson's for shares, the bootstrap for the rest.)
 
 # %%
 summary = summarize(outcome)
@@ -59,8 +62,8 @@ for seed, episode in zip(outcome.seeds[late], outcome.solved_at[late], strict=Tr
 # %% [markdown]
 # ## A seed that went wrong
 #
-# Let us train the slowest of them again and watch it. One seed gives one run, so this is exactly the run from above;
-# `Evaluation` only lets the agent play greedily now and then.
+# We train the slowest seed again and watch it. The same seed gives the same run, so this is exactly the run from above.
+# The callback `Evaluation` only lets the agent play greedily now and then.
 
 # %%
 worst = int(np.argmax(outcome.episodes_to_solved))
@@ -71,12 +74,12 @@ print(run)
 np.testing.assert_array_equal(run.rewards, outcome.outcomes[worst].rewards)  # the very same run
 
 # %% [markdown]
-# Two yardsticks. A reward of 1 per step cannot be worth more than
+# We look at two things. The first is $Q$. A reward of 1 per step cannot be worth more than
 #
 # $$\sum_{k \ge 0} \gamma^k \cdot 1 = \frac{1}{1 - \gamma} = 20,$$
 #
-# so a $Q$ above 20 believes in something that cannot be. And the memory: only a *terminal* transition says that
-# anything can go wrong at all. Once the memory is full, each new transition replaces the oldest.
+# so a $Q$ above 20 expects more than there can be. The second is the memory. Only a *terminal* transition shows that
+# anything can go wrong. Once the memory is full, each new transition replaces the oldest.
 
 # %% tags=["save-one_collapse"]
 full = int(np.argmax(np.cumsum(run.history["steps"]) > config.memory_size))
@@ -103,24 +106,26 @@ print(f"terminal transitions in it: {share[100]:.1%} in episode 100, {share[full
 
 # %% [markdown]
 # The agent learns like the others, up to just below the bar, and there it stays. $Q$ rises above its bound. Then the
-# memory is full, and what it loses first is its own beginning: the falls of hundreds of short episodes.
+# memory is full, and it first loses its oldest part: the falls of hundreds of short episodes.
 #
 # ## Predict
 #
-# Two suspects, each with a good story:
+# There are two suspects, each with a good story:
 #
 # 1. **The memory forgets.** Most batches hardly hold a fall any more, and the network forgets where balance ends.
 # 2. **The target is slow.** $\hat Q$ moves a hundredth of the way to $Q$ at each update, so $Q$ learns from what the
-#    network believed long ago. (The story on the other side: a slow target is there to keep learning stable.)
+#    network believed long ago. (The opposite story: a slow target is there to keep learning stable.)
 #
-# The four curves fit both. A cause shows itself when it is changed. So write down, before you read on: what share of
-# the seeds will be late or never solved if nothing is forgotten? If the target is half as fast, five times as fast, or
-# not there at all ($\tau = 1$)?
+# The four curves fit both stories. To find a cause, change it. Write down before you read on: what share of the seeds
+# will be late or never solved if nothing is forgotten? If the target is half as fast? Five times as fast? If there is
+# no slow target ($\tau = 1$)?
 
 # %% [markdown]
 # ## A memory that forgets nothing
 #
-# The same hundred seeds, with room for 400,000 transitions, more than any of them plays.
+# We train the same hundred seeds with room for 400,000 transitions, more than any of them plays. In the table, *late or
+# never* is the share of seeds that are not solved by episode 500, and *greedy return* is the mean reward of the greedy
+# episodes; 95 % intervals are in brackets.
 
 # %%
 roomy = dataclasses.replace(config, memory_size=400_000)
@@ -135,14 +140,14 @@ print(f"the last of the others is solved in {outcome.solved_at[~late].max():.0f}
 Markdown(sweep_table(Sweep({"memory of 50,000 (the original)": outcome, "nothing is forgotten": larger})))
 
 # %% [markdown]
-# The same seeds get stuck. **Forgetting is not what makes them late**: when the smaller memory is full and begins to
-# forget, all others are solved. (Nor is it what keeps them: with nothing forgotten, no fewer stay unsolved.)
+# The same seeds get stuck. **Forgetting does not make them late**: when the smaller memory is full and begins to
+# forget, all other seeds are already solved. (Nor does forgetting keep them from being solved later: if nothing is
+# forgotten, no fewer stay unsolved.)
 
 # %% [markdown]
 # ## A slower and a faster target
 #
-# `sweep` makes a study of each setting. Only $\tau$ differs, the share of $Q$ that is mixed into $\hat Q$ at each
-# update.
+# `sweep` makes a study of each setting. Only $\tau$ differs: the share by which $\hat Q$ moves to $Q$ at each update.
 
 # %%
 changed = sweep(
@@ -159,14 +164,14 @@ Markdown(sweep_table(by_tau))
 axes = plot_sweep(by_tau)
 
 # %% [markdown]
-# The slower the target, the more seeds are late or never solved. Half as fast, it makes three times as many; that
-# difference is clear. Between the original and the faster ones it is not yet: their intervals overlap.
+# The slower the target, the more seeds are late or never solved. With half the speed, it is three times as many; that
+# difference is clear. Between the original and the faster ones it is not clear yet: their intervals overlap.
 
 # %% [markdown]
 # ## New seeds
 #
-# These hundred seeds raised the suspicion, so they should not be its only judges. Two hundred others, with the
-# original's target and with none:
+# The suspicion came from these hundred seeds, so we test it on others. Here are two hundred new seeds, with the
+# original's slow target and with none:
 
 # %%
 settings = {"tau 0.01 (the original)": config, "tau 1": dataclasses.replace(config, tau=1.0)}
@@ -174,19 +179,19 @@ again = sweep(CartPole(), settings, range(100, 300), evaluate_on=CartPole(), ver
 Markdown(sweep_table(again))
 
 # %% [markdown]
-# Now the intervals are far apart: **the slow target is a cause.** On this task, without it, hardly a seed gets stuck,
+# Now the intervals are far apart: **the slow target is a cause.** On this task, hardly a seed gets stuck without it,
 # and greedy play after the run is better.
 #
-# What this does not show: *why* a slow target does it; that it is the only cause (one of the first hundred is late
-# without it, too); or that a target network is of no use. It was one environment, one network, one discount and one
-# bar; `python -m benchmarks.ablation` changes the last three, too. And with $\tau = 0.005$ all seeds are slower, so
+# This does not show *why* a slow target does it. It does not show that it is the only cause (one of the first hundred
+# is late without it, too), or that a target network is of no use. It was one environment, one network, one $\gamma$ and
+# one bar; `python -m benchmarks.ablation` changes the last three, too. And with $\tau = 0.005$ all seeds are slower, so
 # some of the late ones there are only slow.
 
 # %% [markdown]
 # ## "Equal or better"
 #
-# The original says that greedy play after training scores as well as training or better. Of the seeds that were solved,
-# each with 100 greedy episodes from starts that training has not seen:
+# The original claims that greedy play after training scores as well as training, or better. We check this for the seeds
+# that were solved, each with 100 greedy episodes from starts that training has not seen:
 
 # %%
 solved = [x for x in outcome.outcomes if x.solved_at is not None]
@@ -205,14 +210,14 @@ ax.set(xlabel="Mean return of 100 greedy episodes", ylabel="Seeds")
 _ = ax.legend(loc="upper left")
 
 # %% [markdown]
-# Usually, then, and not always. The stop rule ends training at the first moment at which the mean of 50 episodes is
-# above 225, each played with some of its actions random and with the weights of its own moment. The weights of the last
-# moment are usually better than those, but the stop rule has not tested them.
+# So the claim usually holds, but not always. The stop rule ends training once the mean of the last 50 episodes is above
+# 225. In those episodes some actions were random, and the weights kept changing. The last weights are usually better
+# than those before, but the stop rule has not tested them.
 
 # %% [markdown]
 # ## A fair claim
 #
-# What this notebook may say, each number with the cell above that made it:
+# This is what the cells above show:
 
 # %%
 low, high = np.quantile(outcome.solved_at[~late], (0.05, 0.95))

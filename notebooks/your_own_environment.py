@@ -1,14 +1,14 @@
 # %% [markdown]
 # # Your own environment
 #
-# From an idea to a trained agent, in ten cells. The idea: balls fall from the sky, a paddle on the ground is to catch
-# them. What an agent can learn from is anything that has
+# From an idea to a trained agent, in ten cells. The idea: balls fall from the sky, and a paddle on the ground catches
+# them. An agent can learn from anything that has
 #
 # - an **observation**: some numbers that say how things are (here five),
 # - a choice among a few **actions** (here three: left, stay, right),
-# - a **reward** after each step, a number that says how that was.
+# - a **reward** after each step: a number that says how good the step was.
 #
-# Gymnasium's interface puts this into two methods, `reset` and `step`, and `dqn_keras` asks for nothing else.
+# Gymnasium puts this into two methods, `reset` and `step`, and `dqn_keras` needs nothing else.
 
 # %%
 import os
@@ -24,15 +24,15 @@ from dqn_keras import Config, animate, evaluate, plot_run, record_episode, train
 # %% [markdown]
 # ## The environment
 #
-# All lengths are shares of the picture's side. A ball starts at a random place at the top, drifts to one side and
-# bounces off the walls. Caught, it gives a reward of 1, and the next one falls; missed, the episode is over:
-# `terminated`. All chance comes from `self.np_random`, which `reset(seed=...)` seeds: so a run can be repeated exactly.
-# The observation holds all that matters for what comes next, of about the size of 1 (networks like that).
+# The picture is 1 wide and 1 high. A ball starts at a random place at the top, drifts to one side and bounces off the
+# walls. If the paddle catches it, the reward is 1, and the next ball falls. If not, the episode is over: `terminated`.
+# All random numbers come from `self.np_random`, which `reset(seed=...)` seeds, so a run can be repeated exactly. The
+# observation holds all that matters for what comes next, as numbers of about the size of 1, which suits networks.
 
 
 # %%
 class Catch(gym.Env):
-    """Catch falling balls with a paddle; a reward of 1 for each, until the first is missed."""
+    """A paddle that catches falling balls: a reward of 1 for each ball, until one is missed."""
 
     observation_space = gym.spaces.Box(-1.0, 1.0, (5,), np.float32)  # see _observation
     action_space = gym.spaces.Discrete(3)  # left, stay, right
@@ -61,7 +61,7 @@ class Catch(gym.Env):
         self.x, self.y = self.np_random.uniform(0, 1), 1.0
         self.drift = self.np_random.uniform(-0.02, 0.02)
 
-    def _observation(self):  # ball: place, height, drift; how far the paddle is from under it; paddle: place
+    def _observation(self):  # the ball's place, height and drift; its distance from the paddle; the paddle's place
         return np.array([self.x, self.y, 50 * self.drift, self.x - self.paddle, self.paddle], np.float32)
 
     def render(self):
@@ -87,18 +87,19 @@ print(catch.step(2))
 # %% [markdown]
 # ## A name, and a time limit
 #
-# Registered, it can be made by name, and Gymnasium adds a time limit: 250 steps, which is ten balls. That is a
-# *truncation*, not a termination: at the end of the time nothing is lost, and the learning step does not treat it so.
+# Once it is registered, `gym.make` makes it by its name, and Gymnasium adds a time limit: 250 steps, which is ten
+# balls. The time limit is a *truncation*, not a termination: nothing is lost when time is up, so the targets still
+# count the value of the last state.
 
 # %%
 gym.register("Catch-v0", entry_point=Catch, max_episode_steps=250)
 env = gym.make("Catch-v0")
 
 # %% [markdown]
-# ## Does it keep its word?
+# ## Does it follow the interface?
 #
-# Gymnasium's checker calls everything once and compares: are the observations in the space, is the random state
-# seeded, are the types right, does it draw? It says nothing if all is well.
+# Gymnasium's checker tries every method. Are the observations in the space? Are the types right? Does the same seed
+# give the same episode? Does it render? The checker prints nothing if all is well.
 
 # %%
 check_env(gym.make("Catch-v0", render_mode="rgb_array").unwrapped)
@@ -106,20 +107,20 @@ check_env(gym.make("Catch-v0", render_mode="rgb_array").unwrapped)
 # %% [markdown]
 # ## Train
 #
-# The parameters are those of CartPole, but for the reward that counts as solved: nine balls of ten, as a mean over
-# fifty episodes that still explore.
+# The parameters are those of CartPole, except for the reward that counts as solved: a mean of nine balls of ten over
+# fifty training episodes, random actions included.
 
 # %%
 config = Config(num_episodes=1_000, solved_reward=9)
 run = train(env, config, seed=0)
 
 # %% [markdown]
-# ## What has happened
+# ## What happened in training
 #
-# Above the rewards, below what to look at if they do not rise. The Q-values stay under their bound: no return can be
-# higher than the highest reward at every step, discounted, $r_{max} / (1 - \gamma) = 20$; one ball in 25 steps is
-# worth far less. The error of their predictions rises with what there is to predict. The memory holds fewer and fewer
-# ends of episodes, since fewer balls are missed.
+# The upper panel shows the rewards, the lower ones what to look at if they do not rise. The Q-values stay under their
+# bound: with the highest reward at every step, the return would be $r_{max} / (1 - \gamma) = 20$, and one ball in 25
+# steps is worth far less. The TD error falls at once, and then stays below 0.05. The memory holds fewer and fewer ends
+# of episodes, since fewer balls are missed.
 
 # %% tags=["save-catch_run"]
 axes = plot_run(run, speed=False)
@@ -127,7 +128,7 @@ axes = plot_run(run, speed=False)
 # %% [markdown]
 # ## How good is it?
 #
-# Without exploration, and against what chance catches:
+# We compare greedy play (no random actions) with random actions alone:
 
 # %%
 returns = evaluate(env, run.q_network, num_episodes=100, seed=0)
@@ -148,11 +149,11 @@ picture_env = gym.make("Catch-v0", render_mode="rgb_array")
 animate(record_episode(picture_env, run.q_network, seed=1), fps=25, width=200)
 
 # %% [markdown]
-# The agent goes to where the ball *will* be: nobody has told it about walls.
+# The agent goes to where the ball *will* be, though nobody has told it about walls.
 #
-# Next: other seeds (`study(env, config, seeds=range(20))`), a network of your own
-# (`train(env, q_network=...)`), images instead of numbers, or the same environment in TensorFlow, whose episodes are
-# then compiled. `CartPole` in `dqn_keras/environments/` shows how.
+# What you can do next: train other seeds (`study(env, config, seeds=range(20))`), pass a network of your own
+# (`train(env, q_network=...)`), or observe images instead of numbers. If you write the environment in TensorFlow, its
+# episodes are compiled; `CartPole` in `dqn_keras/environments/` shows how.
 
 # %%
 assert run.solved_at is not None, "this seed was not solved within 1,000 episodes"

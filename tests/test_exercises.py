@@ -82,7 +82,17 @@ class TimeLimitIsTerminal(gym.Wrapper):
         state, reward, terminated, truncated, info = self.env.step(action)
         return state, reward, {ends}, info
 """
-SWEEP = "from dqn_keras import Study, Sweep\nprediction = 'more'\nby_tau = Sweep({{{}}})"
+SWEEP = "from dqn_keras import Study\nprediction = 'more'\nby_tau = Sweep({{{}}})"
+STUDIES = """from types import SimpleNamespace
+from dqn_keras import Study
+def a_study(tau, num_late):
+    ends = num_late * [None] + (100 - num_late) * [250]
+    steps = np.full(251, 20)
+    runs = [SimpleNamespace(seed=k, solved_at=end, steps=steps, greedy_return=np.nan) for k, end in enumerate(ends)]
+    return Study(Config(num_episodes=500, tau=tau), runs)
+prediction = 'more'
+by_tau = Sweep({'tau 0.01': a_study(0.01, 7), 'tau 1': a_study(1.0, 1)})
+"""
 SUM = """from types import SimpleNamespace
 run = SimpleNamespace(q_network=make_q_network(4, 2, seed=0), config=Config())
 wrong_state = {}
@@ -94,6 +104,10 @@ class FallCosts(CartPole):
     def reward(self, state, action, next_state, rng, params=None):
         {body}
 """
+
+
+BOUNDS = "gammas = (0.9, 0.95, 0.99); bounds = {}; weights_of_100 = {}"
+RIGHT_WEIGHTS = [0.9**100, 0.95**100, 0.99**100]
 
 
 @pytest.mark.parametrize(
@@ -114,6 +128,7 @@ class FallCosts(CartPole):
         (2, "prediction = by_tau = None", "write your prediction first"),
         (2, "prediction, by_tau = 'yes', None", "must be one of"),
         (2, "prediction, by_tau = 'fewer', None", "by_tau is missing"),
+        (2, "prediction, by_tau = 'fewer', study", "by_tau must be the result of sweep, and is of type function"),
         (2, SWEEP.format("'a': Study(Config(), [])"), "call them"),
         (2, SWEEP.format("'tau 0.01': Study(Config(), []), 'tau 1': Study(Config(), [])"), "trained with tau=0.01"),
         (2, SWEEP.format("'tau 0.01': Study(Config(), []), 'tau 1': Study(Config(tau=1, gamma=0.9), [])"), "more than"),
@@ -123,6 +138,7 @@ class FallCosts(CartPole):
             SWEEP.format("'tau 0.01': Study(Config(num_episodes=9), []), 'tau 1': Study(Config(), [])"),
             "9 episodes do",
         ),
+        (2, STUDIES, "solved. You predicted 'more'"),
         (3, MEMORY.format(append="pass", sample="pass"), "append stores nothing"),
         (3, MEMORY.format(append=KEEP, sample="pass"), "sample returns nothing"),
         (3, MEMORY.format(append="self.transitions.append(transition)", sample=DRAW), "holds 8 transitions"),
@@ -147,6 +163,7 @@ class FallCosts(CartPole):
         (6, SUM.format([0, 0, 0]) + RIGHT_SUM, "a state is four numbers"),
         (6, SUM.format([2.5, 0, 0, 0]) + RIGHT_SUM, "the episode is over"),
         (6, SUM.format([0, 0, 0, 9]) + RIGHT_SUM, "stay within"),
+        (6, SUM.format([0, 0, 0.2, 3]) + RIGHT_SUM, "they must differ by more than 3"),
         (6, SUM.format([0, 0, 0, 0]) + RIGHT_SUM, ": solved."),
         (7, PENALTY.format(body="pass"), "reward returns nothing"),
         (7, PENALTY.format(body="return tf.where(self.terminal(state, rng), -1.0, 1.0)"), "next_state has fallen"),
@@ -157,17 +174,39 @@ class FallCosts(CartPole):
         ),
         (7, PENALTY.format(body="return -1.0 if self.terminal(next_state, rng) else 1.0"), "cannot compile"),
         (7, PENALTY.format(body="return tf.where(self.terminal(next_state, rng), -1.0, 1.0)"), ": solved."),
-        (8, "gammas = (0.9, 0.95, 0.99); bounds = None", "bounds is missing"),
-        (8, "gammas = (0.9, 0.95, 0.99); bounds = [10, 20, 99]; weights_of_100 = None", "= 100, not 99"),
-        (8, "gammas = (0.9, 0.95, 0.99); bounds = [10, 20, 100]; weights_of_100 = [90, 95, 99]", "100 times gamma"),
+        (8, BOUNDS.format(None, None), "bounds is missing"),
+        (8, BOUNDS.format("[10, 20, 100]", None), "weights_of_100 is missing"),
+        (8, BOUNDS.format(10, RIGHT_WEIGHTS), "bounds must be a list of three numbers"),
+        (8, BOUNDS.format("[10, 20, 100]", [0.9**100]), "weights_of_100 must be a list of three numbers"),
+        (8, BOUNDS.format("[10, 20, 99]", RIGHT_WEIGHTS), "with gamma=0.99 the bound is 100, not 99"),
+        (8, BOUNDS.format("[1 - g for g in gammas]", RIGHT_WEIGHTS), "that is 1 - gamma; divide 1 by it"),
+        (8, BOUNDS.format("[10, 20, 100]", [90, 95, 99]), "100 times gamma"),
+        (8, BOUNDS.format("[10, 20, 100]", [100 * w for w in RIGHT_WEIGHTS]), "the number in percent"),
+        (8, BOUNDS.format("[10, 20, 100]", [1.0, 1.0, 1.0]), "it is 0.9^100 = 2.7e-05, not 1"),
+        (8, BOUNDS.format("[10, 20, 100]", RIGHT_WEIGHTS), ": solved."),
+        (9, "my_config = None", "my_config is missing"),
+        (9, "my_config = {'solved_reward': 475}", "my_config must be a Config, and is dict"),
         (9, "my_config = Config()", "set solved_reward=475"),
+        (9, "my_config = Config(solved_reward=None)", "set solved_reward=475"),
         (9, "my_config = Config(solved_reward=475, solved_window=1)", "may be luck"),
     ],
 )
 def test_a_check_says_what_is_wrong(machinery, number, answer, message, capsys):
-    said = verdict(machinery, number, answer, capsys)
-    assert said.startswith(f"Exercise {number}: ")
-    assert message in said
+    _, heading, said = verdict(machinery, number, answer, capsys).partition(f"Exercise {number}: ")
+    assert heading
+    assert message in heading + said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("num_episodes=60", "not right yet: 0 of 5 seeds are solved (episodes: ['never', 'never', 'never', 'never', "),
+        ("tau=0.05, gamma=0.99, epsilon_min=0.01, num_episodes=1_000", "solved. 5 of 5 seeds are solved, in episodes"),
+    ],
+)
+def test_the_check_of_the_config_trains_five_seeds(machinery, arguments, message, capsys):
+    assert message in verdict(machinery, 9, f"my_config = Config(solved_reward=475, {arguments})", capsys)
 
 
 @pytest.mark.slow

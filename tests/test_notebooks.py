@@ -10,6 +10,17 @@ def rendered(source):
     return nbformat.read(source.with_suffix(".ipynb"), as_version=4)
 
 
+def saved_pictures(path):
+    """The pictures of the cells tagged `save-NAME`, by NAME."""
+    return {
+        tag.removeprefix("save-"): base64.b64decode(picture)
+        for cell in nbformat.read(path, 4).cells
+        for tag in cell.metadata.get("tags", [])
+        if tag.startswith("save-")
+        for (picture,) in [[x.data["image/png"] for x in cell.outputs if "image/png" in x.get("data", {})]]
+    }
+
+
 def inputs(notebook):
     return [(cell.cell_type, cell.source, cell.metadata.get("tags", [])) for cell in notebook.cells]
 
@@ -38,15 +49,22 @@ def test_the_rendered_notebook_is_whole_quiet_and_small(path):
 
 
 def test_the_main_notebook_shows_a_solved_run_and_a_moving_pole():
-    cells = rendered(NOTEBOOKS / "deep_q_network.py").cells
+    path = NOTEBOOKS / "deep_q_network.ipynb"
+    cells = nbformat.read(path, 4).cells
     assert any("Solved with" in output.get("text", "") for cell in cells for output in cell.get("outputs", []))
-    pictures = {}
-    for cell in cells:
-        for tag in cell.metadata.get("tags", []):
-            pictures[tag] = [base64.b64decode(x.data["image/png"]) for x in cell.outputs if "image/png" in x.data]
-    assert b"acTL" in pictures["save-pole"][0][:200]  # the chunk that marks an animated PNG
-    for tag, (picture,) in pictures.items():  # what the README shows is what the notebook shows
-        assert (NOTEBOOKS.parent / "results" / f"{tag.removeprefix('save-')}.png").read_bytes() == picture
+    assert set(saved_pictures(path)) == {"rewards", "pole"}
+    assert b"acTL" in saved_pictures(path)["pole"][:200]  # the chunk that marks an animated PNG
+
+
+@pytest.mark.parametrize("path", IS_RUN, ids=lambda path: path.stem)
+def test_a_picture_in_results_is_the_notebooks(path):
+    for name, picture in saved_pictures(path).items():
+        assert (NOTEBOOKS.parent / "results" / f"{name}.png").read_bytes() == picture, f"run: make notebook ({name})"
+
+
+def test_every_picture_that_is_compared_is_saved_by_one_notebook():
+    names = [name for path in IS_RUN for name in saved_pictures(path)]
+    assert len(names) == len(set(names)) >= 8
 
 
 def test_the_rendered_notebook_does_not_depend_on_the_python_that_rendered_it():
