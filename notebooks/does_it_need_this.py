@@ -57,7 +57,7 @@ settings = {
 # ## Predict
 #
 # How many of a hundred seeds will be solved by episode 500? Replace each `None` by a number before you go on. For the
-# original, the README says about 90.
+# original, [it was 90](../results/reproduction.md).
 
 # %%
 prediction = {
