@@ -1,7 +1,7 @@
 """Render every notebook: NAME.py (the source) -> NAME.ipynb, run from top to bottom, with its outputs.
 
 The same source on the same machine gives the same bytes: cells are numbered, timing is left out. An output picture of
-a cell tagged `save-NAME` also goes to results/NAME.png, where the README and the docs show it. If a cell fails, nothing is
+a cell tagged `save-NAME` also goes to results/NAME.png, for the README and the docs. If a cell fails, nothing is
 written.
 
 A script with cells tagged `solution` gives two notebooks. NAME.ipynb is the student's: without these cells, and not
