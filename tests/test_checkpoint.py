@@ -104,7 +104,7 @@ def test_if_no_checkpoint_is_whole_the_error_says_why_of_each(tmp_path):
         ({"env": gym.make("CartPole-v1", sutton_barto_reward=True)}, r"^env is .*, got .*'sutton_barto_reward': True"),
         ({"env": CartPole()}, r"^env is .*, got \{'name': 'CartPole \(functional\)'"),
         ({"env": gym.make("MountainCar-v0")}, r"^env is .*, got \{'name': 'MountainCar-v0'"),
-        ({"resume": False}, r"^checkpoint .*0040\.npz is there already; resume=True"),
+        ({"resume": False}, r"^checkpoint .*0040\.npz exists already; resume=True"),
     ],
     ids=lambda x: "",
 )

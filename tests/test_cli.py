@@ -259,22 +259,22 @@ ERRORS = {
     "train CartPole-v1 --tau 3": "tau must be a finite number above 0, at most 1, got 3.0",
     "train Nope-v1": "Environment `Nope` doesn't exist.",
     "train no_module:Nope-v1": "No module named 'no_module'",
-    "train FrozenLake-v1": "FrozenLake-v1 has the observation space Discrete(16); --flatten makes one axis of it",
-    "train Pendulum-v1": "env Pendulum-v1 has the action space Box(-2.0, 2.0, (1,), float32); supported is Discrete",
+    "train FrozenLake-v1": "FrozenLake-v1 has the observation space Discrete(16); use --flatten",
+    "train Pendulum-v1": "env Pendulum-v1 has the action space Box(-2.0, 2.0, (1,), float32); it must be Discrete",
     "train CarRacing-v3 --env-args continuous=False": "env CarRacing-v3 has observations of shape (96, 96, 3)",
     "train CartPole-v1 --env-args gravity": "env_args must be of the form NAME=VALUE, got 'gravity'",
     "train CartPole-v1 --env-args wings=2": "CartPole-v1 wings=2 cannot be made: TypeError: CartPoleEnv.__init__() got",
     "train LunarLander-v3 --env-args gravity=5": "LunarLander-v3 gravity=5 cannot be made: AssertionError: gravity",
     "train FrozenLake-v1 --flatten --env-args map_name=9x9": "FrozenLake-v1 map_name='9x9' cannot be made: KeyError",
     "study CartPole-v1 --num-episodes 20": "num_episodes must be at least solved_window=50 in a study",
-    "train LunarLander-v3 --compiled": "compiled episodes are for CartPole-v1, Acrobot-v1, MountainCar-v0 as they are",
+    "train LunarLander-v3 --compiled": "compiled is only for CartPole-v1, Acrobot-v1, MountainCar-v0, without",
     "train CartPole-v1 --seed -1": "seed must be a whole number from 0",
     "train CartPole-v1 --loss hubr": "loss must be a name that Keras knows, such as 'mse', got 'hubr'",
-    "train Nope-v1 --preset": "preset is there for CartPole-v1",
+    "train Nope-v1 --preset": "preset exists for CartPole-v1",
     "train CartPole-v1 --preset --tau 7": "tau must be a finite number above 0, at most 1, got 7.0",
     "train CartPole-v1 --steps-count-from run --num-steps 10": "batch_size must be at most num_steps = 10, got 64",
-    "sweep CartPole-v1 --vary tua=1": "vary must be of the form NAME=VALUE,VALUE with a name of --help, got 'tua=1'",
-    "sweep CartPole-v1 --vary tau": "vary must be of the form NAME=VALUE,VALUE with a name of --help, got 'tau'",
+    "sweep CartPole-v1 --vary tua=1": "vary must be of the form NAME=VALUE,VALUE with a name from --help, got 'tua=1'",
+    "sweep CartPole-v1 --vary tau": "vary must be of the form NAME=VALUE,VALUE with a name from --help, got 'tau'",
     "sweep CartPole-v1 --vary tau=0.1,x": "tau must be a finite number above 0, at most 1, got 'x'",
     "sweep CartPole-v1 --vary loss=mse,x": "settings['loss=x']: loss must be a name that Keras knows",
     "sweep CartPole-v1 --vary double=1": "double must be True or False, got 1",
@@ -363,7 +363,7 @@ def test_folders_that_are_not_whole_are_told(capfd):
         "dqn-keras: a has no agent.keras: its run is in progress or was killed; to continue it: dqn-keras resume"
     )
     assert told[2] == "dqn-keras: a has no episode in log.csv yet\n"
-    assert told[3].startswith("dqn-keras: a/config.json is not as `dqn-keras train` writes it: 'config'")
+    assert told[3].startswith("dqn-keras: a/config.json is not what `dqn-keras train` writes: 'config'")
 
 
 @pytest.mark.slow

@@ -44,7 +44,7 @@ UNSUPPORTED = [
 
 @pytest.mark.parametrize(("field", "space"), UNSUPPORTED)
 def test_an_unsupported_space_is_named_with_what_is_supported(field, space):
-    with pytest.raises(ValueError, match=rf"env Corridor has the {field.replace('_', ' ')} .*; supported is"):
+    with pytest.raises(ValueError, match=rf"env Corridor has the {field.replace('_', ' ')} .*; it must be"):
         CheckedEnv(Corridor(**{field: space}))
 
 

@@ -235,7 +235,7 @@ def test_a_full_disk_is_a_warning_and_the_next_better_network_is_kept(env, tmp_p
                 monkeypatch.undo()
 
     greedy = evaluation(tmp_path / "best.keras", every_steps=1)
-    with pytest.warns(UserWarning, match=r"^best .* could not be written \(no space left\); the last one stays"):
+    with pytest.warns(UserWarning, match=r"^best .* could not be written \(no space left\); the earlier file stays"):
         play(env, greedy, DiskIsFull())
     kept = load_q_network(tmp_path / "best.keras")
     assert evaluate(gym.make("CartPole-v1"), kept, 3, seed=0).mean() == greedy.best_return
@@ -267,7 +267,7 @@ def test_an_environment_that_does_not_fit_is_told_before_any_work_starts(cartpol
 
 
 def test_two_evaluations_in_a_run_are_refused(env):
-    with pytest.raises(ValueError, match=r"^callbacks must hold one Evaluation, .* got 2$"):
+    with pytest.raises(ValueError, match=r"^callbacks must hold only one Evaluation: .* got 2$"):
         play(env, evaluation(), evaluation())
 
 

@@ -443,7 +443,7 @@ def test_the_wrapper_that_is_named_for_a_space_works(space, way):
         assert "a gymnasium.ObservationWrapper of your own can" in str(caught.value)
         assert "FlattenObservation" not in str(caught.value)
         return
-    assert f"({way} makes one of " in str(caught.value)
+    assert f"(use {way}" in str(caught.value)
     wrapped = CheckedEnv(eval(way, {"gymnasium": gym, "env": env}))
     assert wrapped.reset(0, 0).shape == wrapped.spaces.state_shape
 
@@ -457,22 +457,22 @@ def test_the_command_line_flattens_what_can_be_flattened_and_says_what_cannot(na
     if is_possible:
         assert len(flat.make().observation_space.shape) == 1
     else:
-        with pytest.raises(ValueError, match=r"^Grid-v0 has the observation space .*; (gymnasium\.|no wrapper)"):
+        with pytest.raises(ValueError, match=r"^Grid-v0 has the observation space .*; (use gymnasium\.|no wrapper)"):
             flat.make()
     if not isinstance(space, spaces.Box):
-        hint = "--flatten makes one axis of it$" if is_possible else r"(gymnasium\.|no wrapper)"
+        hint = "use --flatten$" if is_possible else r"(use gymnasium\.|no wrapper)"
         with pytest.raises(ValueError, match=rf"^Grid-v0 has the observation space .*; {hint}"):
             plain.make()
 
 
 NO_ENVS = {
-    "a name": ("CartPole-v1", r"'CartPole-v1'; gymnasium\.make\(\"CartPole-v1\"\) makes one$"),
-    "a spec": (gym.spec("CartPole-v1"), r"the EnvSpec of CartPole-v1; gymnasium\.make\(spec\) makes one$"),
-    "a class": (Corridor, r"the class Corridor; Corridor\(\) makes one$"),
-    "a functional class": (CartPole, r"the class CartPole; CartPole\(\) makes one$"),
+    "a name": ("CartPole-v1", r"'CartPole-v1'; use gymnasium\.make\(\"CartPole-v1\"\)$"),
+    "a spec": (gym.spec("CartPole-v1"), r"the EnvSpec of CartPole-v1; use gymnasium\.make\(spec\)$"),
+    "a class": (Corridor, r"the class Corridor; use Corridor\(\)$"),
+    "a functional class": (CartPole, r"the class CartPole; use CartPole\(\)$"),
     "a vector environment": (
         gym.make_vec("CartPole-v1", 2),
-        r"the vector environment .*; one environment is played at a time, as gymnasium\.make makes it$",
+        r"the vector environment .*; use gymnasium\.make: only one environment is played at a time$",
     ),
     "nothing": (None, "None$"),
 }

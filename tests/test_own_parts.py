@@ -278,9 +278,7 @@ def test_a_network_of_an_unregistered_class_is_refused_when_it_is_saved(cartpole
 
     network = keras.Sequential([keras.Input((4,)), Unregistered(), keras.layers.Dense(2)])
     run = train(cartpole, QUICK, seed=0, q_network=network, verbose=0)
-    with pytest.raises(
-        ValueError, match=r"^q_network has a layer that no file can name: .*register_keras_serializable"
-    ):
+    with pytest.raises(ValueError, match=r"^q_network has a layer that cannot be saved: .*register_keras_serializable"):
         run.save(tmp_path / "agent.keras")
 
 

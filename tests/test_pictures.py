@@ -181,7 +181,7 @@ def test_the_other_entries_of_the_state_stay_as_they_are():
         ({"x": (0, 1, 1)}, r"^x must have its lowest value before its highest"),
         ({"y": (0, 0, 1)}, r"^x and y must be different entries of the state, got 0 for both"),
         ({"y": (1, 0)}, r"^y must be an index, a lowest and a highest value"),
-        ({"state": [0.0]}, r"^state must have 4 entries, as q_network takes them, got 1"),
+        ({"state": [0.0]}, r"^state must have 4 entries, the input size of q_network, got 1"),
         ({"limits": (2, 1)}, r"^limits must be two Q-values, the lower first"),
     ],
 )

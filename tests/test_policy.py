@@ -31,7 +31,7 @@ def test_explores_below_epsilon_and_is_greedy_from_it_on(q):
 
 
 def test_values_of_many_states_are_refused_and_tensors_are_taken(rng):
-    with pytest.raises(ValueError, match="those of one state"):
+    with pytest.raises(ValueError, match="the values of one state"):
         action(np.zeros((10, 2)), 0.0, rng)
     assert action(tf.constant([[1.0, 3.0]]), 0.0, rng) == 1
 

@@ -88,7 +88,7 @@ def test_a_folder_imports_no_module_unless_the_user_names_it(folder, capfd):
 def test_an_environment_of_the_wrong_kind_is_told(folder, environment, capfd):
     change_environment(folder, **environment)
     assert main(COMMANDS[0].split()) == 2
-    assert "config.json is not as `dqn-keras train` writes it" in capfd.readouterr().err
+    assert "config.json is not what `dqn-keras train` writes" in capfd.readouterr().err
 
 
 def signed(body):
