@@ -196,7 +196,7 @@ def test_a_resumed_run_refuses_a_file_that_holds_no_network_of_it(tmp_path):
         (lambda: best.write_bytes(best.read_bytes()[:-100]), "is not a network that can be loaded"),
     ]:
         write()
-        with pytest.raises(ValueError, match=rf"^best .*best\.keras must hold a network of the run.*{why}"):
+        with pytest.raises(ValueError, match=rf"^best .*best\.keras must hold a network of the resumed run.*{why}"):
             play(Corridor(limit=3), greedy, config=config, **arguments)
     best.unlink()
     play(Corridor(limit=3), greedy, config=config, **arguments)

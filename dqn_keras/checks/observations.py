@@ -167,8 +167,8 @@ class Watch:
         if len(features):
             i = int(features[0])
             self._warn(
-                f"{self._feature(i)} of the observations changes in steps that are lost in float32, the dtype of stored "
-                f"states (it is about {size[i]:.1e}): subtract an offset from it, and then scale it, in a "
+                f"{self._feature(i)} of the observations changes in steps that are lost in float32, the dtype of "
+                f"stored states (it is about {size[i]:.1e}): subtract an offset from it, and then scale it, in a "
                 "gymnasium.wrappers.TransformObservation"
             )
 

@@ -141,8 +141,7 @@ def read_settings_to_play(folder: Path, imported: str | None) -> Settings:
         module, is_named, _ = str(name).rpartition(":")
         if is_named and module != imported:
             raise ValueError(
-                f"{folder} needs the module {module!r}. Importing it runs its code; "
-                f"if you trust it: --import {module}"
+                f"{folder} needs the module {module!r}. Importing it runs its code; if you trust it: --import {module}"
             )
     return settings
 
