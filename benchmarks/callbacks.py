@@ -56,15 +56,15 @@ def main() -> None:
         ("compiled episodes", CartPole, 600),
     ]:
         config = Config(num_episodes=num_episodes, solved_reward=1e6)
-        silent, told = [], []
+        silent, logged = [], []
         for _ in range(rounds + 1):
             silent.append(seconds(make_env, config, (), 0))
             with tempfile.TemporaryDirectory() as folder:
                 log = keras.callbacks.CSVLogger(Path(folder) / "log.csv")
-                told.append(seconds(make_env, config, [log], 2))
-        silent, told = silent[1:], told[1:]  # the first round compiles
-        low, ratio, high = statistics.quantiles([b / a for a, b in zip(silent, told, strict=True)])
-        times = [f"{statistics.median(x):.2f}" for x in (silent, told)]
+                logged.append(seconds(make_env, config, [log], 2))
+        silent, logged = silent[1:], logged[1:]  # the first round compiles
+        low, ratio, high = statistics.quantiles([b / a for a, b in zip(silent, logged, strict=True)])
+        times = [f"{statistics.median(x):.2f}" for x in (silent, logged)]
         print(
             f"| {name} | {num_episodes} | {times[0]} | {times[1]} | {ratio:.3f} ({low:.3f} to {high:.3f}) |", flush=True
         )

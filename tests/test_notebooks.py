@@ -24,7 +24,7 @@ def test_every_notebook_has_its_script():
 
 
 @pytest.mark.parametrize("path", CONVERTED, ids=lambda path: path.stem)
-def test_the_rendered_notebook_is_of_its_script(path):
+def test_the_rendered_notebook_has_the_cells_of_its_script(path):
     assert inputs(nbformat.read(path, 4)) == inputs(CONVERTED[path]), f"run: make notebook ({path.name} is stale)"
 
 
@@ -45,7 +45,7 @@ def test_the_main_notebook_shows_a_solved_run_and_a_moving_pole():
         for tag in cell.metadata.get("tags", []):
             pictures[tag] = [base64.b64decode(x.data["image/png"]) for x in cell.outputs if "image/png" in x.data]
     assert b"acTL" in pictures["save-pole"][0][:200]  # the chunk that marks an animated PNG
-    for tag, (picture,) in pictures.items():  # what the README shows is what the notebook shows
+    for tag, (picture,) in pictures.items():  # the README shows the notebook's pictures
         assert (NOTEBOOKS.parent / "results" / f"{tag.removeprefix('save-')}.png").read_bytes() == picture
 
 

@@ -22,7 +22,7 @@ def test_the_readmes_scripts_run(script):
     assert ("plot" in script) == bool(list(Path.cwd().glob("*.png"))), "a script shows its picture, or saves it"
 
 
-def test_the_readmes_commands_are_ones():
+def test_the_readmes_commands_exist():
     commands = re.findall(r"^dqn-keras (.*)$", README, re.MULTILINE)
     assert len(commands) == 6
     for command in commands:
