@@ -1,9 +1,9 @@
-"""Which part of the algorithm does what? The compiled run with one change at a time, each over many seeds.
+"""Measures what each part of the algorithm does: compiled runs with one change at a time, each over many seeds.
 
     python -m benchmarks.ablation --file ablation.npz --figure results/ablation.png > results/ablation.md
     python -m benchmarks.ablation --seeds 20
 
-With --file, the outcomes are kept in that file, and a repeated command trains only the missing seeds.
+With --file, the outcomes are saved in that file, and a repeated command trains only the missing seeds.
 """
 
 import argparse
@@ -24,7 +24,7 @@ ORIGINAL = Config()
 
 
 class TimeLimitIsTerminal(CartPole):
-    """CartPole whose 500th step is said to be terminal, as many published programs store it."""
+    """CartPole with a terminal 500th step, as many published programs store it."""
 
     def initial(self, rng: Any) -> Any:
         return super().initial(rng), tf.constant(0)
@@ -80,7 +80,7 @@ SETTINGS: dict[str, Config | dict[str, Any]] = {
 
 
 FEWER_SEEDS = {TWO_LAYERS: 50, ORIGINAL_AT_475: 50}
-"""Settings whose seeds are almost never solved, so that each takes 10 to 50 times as long."""
+"""Settings that solve almost no seed, so that each seed takes 10 to 50 times as long."""
 
 
 def run(num_seeds: int, file: Path | None) -> Sweep:
@@ -98,8 +98,8 @@ def run(num_seeds: int, file: Path | None) -> Sweep:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=1_000, help="seeds 0, 1, ... of each setting (1,000)")
-    parser.add_argument("--file", type=Path, help="a file for the outcomes")
-    parser.add_argument("--figure", type=Path, help="a file for the picture")
+    parser.add_argument("--file", type=Path, help="save the outcomes in this file")
+    parser.add_argument("--figure", type=Path, help="save the picture in this file")
     arguments = parser.parse_args()
 
     outcome = run(arguments.seeds, arguments.file)

@@ -1,4 +1,4 @@
-"""Where the time of a compiled turn goes: its parts alone, each in a loop that XLA compiles, on one core.
+"""Measures where the time of a compiled turn goes: each part alone, in a loop that XLA compiles, on one core.
 
     python -m benchmarks.anatomy > results/anatomy.md
 
@@ -32,7 +32,7 @@ TURNS = 3_000
 
 
 def measure(part: Callable[[tf.Tensor], tf.Tensor]) -> tuple[float, int]:
-    """Returns microseconds and kernels of one call of `part` (number of the turn -> a scalar), compiled in a loop."""
+    """Returns the microseconds and kernels of a call of `part` (number of the turn -> a scalar), compiled in a loop."""
 
     def loop() -> tf.Tensor:
         start = (tf.constant(0), tf.constant(0.0))
@@ -49,7 +49,7 @@ def measure(part: Callable[[tf.Tensor], tf.Tensor]) -> tuple[float, int]:
 
 
 def num_kernels(program: str) -> int:
-    """Returns the kernels in one pass of the outermost loop of a program, given as text by XLA."""
+    """Returns the number of kernels in one pass of the outermost loop of a program, given as XLA's text."""
     computations, entry = {}, ""
     for text in re.split(r"\n(?=%|ENTRY)", program):
         name = re.match(r"(?:ENTRY )?(%\S+)", text)
@@ -74,7 +74,7 @@ def num_kernels(program: str) -> int:
 
 
 def matmul_gigaflops(size: int = 768) -> float:
-    """Of a large matrix product, the fastest that this core does arithmetic in XLA."""
+    """Returns the speed of a large matrix product, the fastest arithmetic of this core in XLA."""
     x = tf.random.stateless_normal([size, size], [0, 0])
     product = tf.function(lambda a: a @ a, jit_compile=True)
     product(x).numpy()
@@ -87,7 +87,7 @@ def matmul_gigaflops(size: int = 768) -> float:
 
 
 def whole_turn() -> tuple[float, float]:
-    """Microseconds of a turn, and env steps per second, of long episodes."""
+    """Returns the microseconds of a turn, and env steps per second, in long episodes."""
     agent, env = make_agent((4,), 2, CONFIG, 0), CartPole()
     loop = episodes(env, check_functional(env), agent, CONFIG)
     while agent.memory.num_appended < 60_000:  # learn to balance first
@@ -105,7 +105,7 @@ def whole_turn() -> tuple[float, float]:
 
 def parts_of_a_turn() -> dict[str, Callable[[tf.Tensor], tf.Tensor]]:
     agent, rng, env = make_agent((4,), 2, CONFIG, 0), np.random.default_rng(0), CartPole()
-    learner: Learner = stand_in((4, 64, 2), jit_compile=True)  # whose layers are those that a program compiles
+    learner: Learner = stand_in((4, 64, 2), jit_compile=True)  # it has the layers that a program compiles
     data = rng.normal(size=agent.memory.rows.shape).astype(np.float32)
     data[:, 8:] = np.stack([rng.integers(2, size=len(data)), np.ones(len(data)), np.zeros(len(data))], axis=1)
     rows, num_appended = tf.Variable(data), tf.Variable(0, dtype=tf.int64)

@@ -1,9 +1,9 @@
-"""What a log file and the progress bar cost.
+"""Measures what a log file and the progress bar cost.
 
     python -m benchmarks.callbacks [--rounds 15] > results/callbacks.md
 
-Whole runs of `train` in one process on one core, in turn: silent, and with keras.callbacks.CSVLogger and verbose=2. The
-ratio is that of the two times within a round. Both are compiled before, and give the same results.
+Times whole runs of `train` in one process on one core, in turn: silent, and with keras.callbacks.CSVLogger and
+verbose=2. The ratio compares the two times within a round. Both are compiled before, and give the same results.
 """
 
 import argparse
@@ -38,7 +38,7 @@ def seconds(make_env: Callable, config: Config, callbacks: Sequence, verbose: in
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=15, help="rounds that are timed (15)")
+    parser.add_argument("--rounds", type=int, default=15, help="number of timed rounds (15)")
     rounds = parser.parse_args().rounds
 
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
@@ -56,15 +56,15 @@ def main() -> None:
         ("compiled episodes", CartPole, 600),
     ]:
         config = Config(num_episodes=num_episodes, solved_reward=1e6)
-        silent, told = [], []
+        silent, logged = [], []
         for _ in range(rounds + 1):
             silent.append(seconds(make_env, config, (), 0))
             with tempfile.TemporaryDirectory() as folder:
                 log = keras.callbacks.CSVLogger(Path(folder) / "log.csv")
-                told.append(seconds(make_env, config, [log], 2))
-        silent, told = silent[1:], told[1:]  # the first has compiled
-        low, ratio, high = statistics.quantiles([b / a for a, b in zip(silent, told, strict=True)])
-        times = [f"{statistics.median(x):.2f}" for x in (silent, told)]
+                logged.append(seconds(make_env, config, [log], 2))
+        silent, logged = silent[1:], logged[1:]  # the first round compiles
+        low, ratio, high = statistics.quantiles([b / a for a, b in zip(silent, logged, strict=True)])
+        times = [f"{statistics.median(x):.2f}" for x in (silent, logged)]
         print(
             f"| {name} | {num_episodes} | {times[0]} | {times[1]} | {ratio:.3f} ({low:.3f} to {high:.3f}) |", flush=True
         )

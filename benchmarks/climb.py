@@ -1,10 +1,10 @@
-"""When does the learning curve climb: once the memory holds enough, or once the network has learned often enough?
+"""Measures when the learning curve climbs: when the memory holds enough, or when the network has learned enough.
 
     python -m benchmarks.climb [--seeds 100] > results/climb.md
 
 The climb is the first episode after which the mean reward of the last 20 episodes is above 50 (random actions reach
-about 22). Half of the runs start with an empty memory, the others with one that 5,000 random actions have filled. All
-else is the same: the memory is filled by another run, and so epsilon begins at its first value in both.
+about 22). Half of the runs start with an empty memory, the other half with 5,000 transitions of random actions. All
+else is the same: another run fills the memory, so epsilon begins at its first value in both halves.
 """
 
 import argparse
@@ -34,7 +34,7 @@ NUM_PREFILLED = 5_000
 
 
 class Climb(NamedTuple):
-    """What one run needed until the climb."""
+    """Episodes, steps and updates of one run until the climb."""
 
     episodes: int
     env_steps: int
@@ -42,7 +42,7 @@ class Climb(NamedTuple):
 
 
 def climb(config: Config, seed: int, memory: ReplayMemory | None) -> Climb:
-    """Trains until the climb, from a copy of `memory`, or an empty one."""
+    """Trains until the climb, with a copy of `memory` or an empty memory."""
     spaces, formulas, agent = prepare(CartPole(), config, seed, None, None, td_targets, None)
     num_before = 0 if memory is None else memory.num_appended
     if memory is not None:
@@ -58,8 +58,8 @@ def climb(config: Config, seed: int, memory: ReplayMemory | None) -> Climb:
 
 
 def random_transitions(seed: int) -> ReplayMemory:
-    """Returns a memory that random actions have filled."""
-    num_steps = NUM_PREFILLED + 1  # a run must have an update, which comes after these transitions
+    """Returns a memory with transitions of random actions."""
+    num_steps = NUM_PREFILLED + 1  # a run must have an update; it comes after these transitions
     config = Config(learning_starts=NUM_PREFILLED, num_steps=num_steps, memory_size=num_steps, steps_per_update=1)
     memory = train(CartPole(), config, seed, verbose=0).agent.memory
     memory.num_appended = NUM_PREFILLED

@@ -1,11 +1,11 @@
-"""What other numbers and parts of your own cost beside the training: CPU seconds and memory.
+"""Measures what other numbers and your own parts cost in addition to training: CPU seconds and memory.
 
     python -m benchmarks.own_parts > results/own_parts.md
 
-Each row is a process of its own, on one core, that calls `train` several times, each time with something new. Rows with
-own parts begin with a run with the defaults, which is not counted. The seconds are a run's CPU time less that of a run
-of the same Config with the default parts, made right after it, when those need no compilation. Memory is the process's
-resident memory, after Python's garbage collector, and after glibc has returned what it does not use.
+Each row is a separate process, on one core, that calls `train` several times, each time with something new. Rows with
+own parts begin with a run with the defaults, which is not counted. The seconds are the CPU time of a run minus the CPU
+time of a run of the same Config with the default parts, which comes right after it and needs no compilation. Memory is
+the resident memory of the process, after Python's garbage collection, and after glibc has returned unused memory.
 """
 
 import ctypes
@@ -48,7 +48,7 @@ LOSSES = [
 
 
 def new_parts() -> dict[str, Any]:
-    """A network, an optimizer and targets: new objects at each call, that compute the same."""
+    """Returns a network, an optimizer and targets: new objects at each call, which compute the same."""
     layers = [keras.Input((4,)), keras.layers.Dense(64, "relu"), keras.layers.Dense(2)]
     optimizer = keras.optimizers.AdamW(0.001, global_clipnorm=10)
     return {"q_network": keras.Sequential(layers), "optimizer": optimizer, "targets": double_td_targets}
@@ -74,13 +74,13 @@ def cpu_seconds(make_env: Callable, config: Config, parts: dict[str, Any]) -> fl
 
 def megabytes() -> float:
     gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)  # glibc gives back what it keeps for later
+    ctypes.CDLL(None).malloc_trim(0)  # glibc returns unused memory
     with open("/proc/self/statm") as file:  # Linux
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def run_series(loop: str, name: str) -> dict[str, list[float]]:
-    """Of each run the seconds, and what the process holds before the first and after each."""
+    """Returns the seconds of each run, and the memory of the process before the first run and after each run."""
     make_env = ENVIRONMENTS[loop]
     if name != "six Configs":
         cpu_seconds(make_env, CONFIG, {})
@@ -105,7 +105,7 @@ def print_row(loop: str, name: str, seconds: list[float], megabytes: list[float]
 
 
 def main() -> None:
-    if len(sys.argv) == 3:  # one row, in a process of its own
+    if len(sys.argv) == 3:  # one row, in a separate process
         print(json.dumps(run_series(*sys.argv[1:])))
         return
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # Linux; the processes inherit it

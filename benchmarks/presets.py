@@ -1,13 +1,13 @@
-"""Do the presets solve their environments, each by Gymnasium's own threshold?
+"""Measures whether the presets solve their environments, each by Gymnasium's own threshold.
 
     python -m benchmarks.presets --file presets.npz > results/presets.md
     python -m benchmarks.presets --seeds 2
 
-With --file, the outcomes are kept in that file, and a repeated command trains only the missing seeds.
+With --file, the outcomes are saved in that file, and a repeated command trains only the missing seeds.
 
 CartPole's preset has the recommended numbers of benchmarks.ablation. Acrobot's has the best numbers that
-benchmarks.tune found, rounded. MountainCar's (after such a search) and LunarLander's were tuned by hand. All this used
-the seeds 1000 to 1023, which are not reported; only CartPole's was found on seeds that include the reported ones.
+benchmarks.tune found, rounded. MountainCar's (after such a search) and LunarLander's were tuned by hand. These three
+used seeds 1000 to 1023, which are not reported. Only CartPole's was found on seeds that include the reported ones.
 """
 
 import argparse
@@ -27,12 +27,12 @@ NUM_SEEDS = {"LunarLander-v3": 10}  # minutes each; the others have 20
 
 
 def make_env(env_id: str) -> Any:
-    """Make the functional twin of an environment, or the environment itself if it has none."""
+    """Makes the functional twin of an environment, or the environment itself if it has none."""
     return TWINS[env_id]() if env_id in TWINS else gym.make(env_id)
 
 
 def run(most: int, file: Path | None) -> dict[str, Study]:
-    """Make the study of each preset, or continue the one in `file`."""
+    """Makes the study of each preset, or continues the one in `file`."""
     found = {}
     for env_id, config in presets.items():
         seeds = range(min(most, NUM_SEEDS.get(env_id, 20)))
@@ -42,7 +42,7 @@ def run(most: int, file: Path | None) -> dict[str, Study]:
 
 
 def row(env_id: str, study: Study) -> str:
-    """The row of one environment in the table."""
+    """Returns the row of one environment in the table."""
     summary, seconds = summarize(study), study.to_dict()["seconds"]
     loop = "compiled" if env_id in TWINS else "Gymnasium's"
     threshold, seeds = gym.spec(env_id).reward_threshold, len(study.outcomes)
@@ -56,8 +56,8 @@ def row(env_id: str, study: Study) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=20, help="most seeds of each environment (20)")
-    parser.add_argument("--file", type=Path, help="a file for the outcomes")
+    parser.add_argument("--seeds", type=int, default=20, help="maximum number of seeds of each environment (20)")
+    parser.add_argument("--file", type=Path, help="save the outcomes in this file")
     arguments = parser.parse_args()
 
     found = run(arguments.seeds, arguments.file)

@@ -1,10 +1,10 @@
-"""Does the package reach published tables of DQN? Stable-Baselines3 runs the same settings here, too.
+"""Measures whether the package reaches published results of DQN; Stable-Baselines3 runs the same settings here.
 
     python -m benchmarks.published > results/published.md
     python -m benchmarks.published --programs stable_baselines3 --seeds 3
 
 One process, one core. Every run adds one line to results/published.csv. A run that is in the file is not repeated, so
-the command can be interrupted and given again; --seeds 0 only writes the page.
+you can interrupt the command and repeat it. --seeds 0 only writes the page.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from dqn_keras.environments import TWINS
 from dqn_keras.statistics import Estimate
 
 RECORDS = Path("results/published.csv")
-FIRST_START = 1_000_000  # start states of the greedy episodes: gym seeds from here on, which no training run uses
+FIRST_START = 1_000_000  # greedy episodes use gym seeds from here on, which no training run uses
 
 
 class Settings(NamedTuple):
@@ -46,7 +46,7 @@ class Settings(NamedTuple):
     steps_per_target: int
     steps_per_update: int
     gradient_steps: int
-    epsilon_fraction: float  # of num_steps, over which epsilon falls in a straight line from 1
+    epsilon_fraction: float  # share of num_steps over which epsilon falls linearly from 1
     epsilon_min: float
     hidden_units: tuple[int, int]
     clipnorm: float | None  # of the gradient's global norm
@@ -71,7 +71,7 @@ CLEANRL = Settings(
 
 @dataclass
 class Record:
-    """What one run reached."""
+    """The results of one run."""
 
     program: str
     environment: str
@@ -85,7 +85,7 @@ class Record:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=20, help="at most seeds 0, 1, ... (20 of CartPole, 10 of others)")
+    parser.add_argument("--seeds", type=int, default=20, help="most seeds, 0, 1, ... (20 of CartPole, 10 of others)")
     parser.add_argument("--programs", nargs="+", choices=PROGRAMS, default=list(PROGRAMS))
     names = [settings.environment for settings in ZOO]
     parser.add_argument("--environments", nargs="+", choices=names, default=names)
@@ -98,7 +98,7 @@ def main() -> None:
 
 
 def missing_runs(programs: list[str], environments: list[str], max_seeds: int) -> Iterator[tuple[str, Settings, int]]:
-    """Yields the runs that the file lacks, one seed of every environment after the other."""
+    """Yields the runs that are not in the file, seed by seed over all environments."""
     done = {(record.program, record.environment, record.seed) for record in read_records()}
     for seed in range(max_seeds):
         for program in programs:
@@ -127,7 +127,7 @@ def append_record(record: Record) -> None:
 
 
 def run_stable_baselines3(program: str, settings: Settings, seed: int) -> Record:
-    """Trains and evaluates Stable-Baselines3's DQN, with its own defaults where the settings say nothing."""
+    """Trains and evaluates Stable-Baselines3's DQN, with its own defaults for everything not in the settings."""
     import torch
     from stable_baselines3 import DQN
     from stable_baselines3.common.monitor import Monitor
@@ -160,7 +160,7 @@ def run_stable_baselines3(program: str, settings: Settings, seed: int) -> Record
 
 
 def run_dqn_keras(program: str, settings: Settings, seed: int, q_network: keras.Model | None = None) -> Record:
-    """Trains and evaluates this package's DQN, from the network that it makes or from one that it is given."""
+    """Trains and evaluates this package's DQN, with its default network or a given one."""
     start = time.perf_counter()
     env = TWINS[settings.environment]() if settings.environment in TWINS else gym.make(settings.environment)
     optimizer = keras.optimizers.Adam(settings.learning_rate, epsilon=1e-8, global_clipnorm=settings.clipnorm)
@@ -168,12 +168,12 @@ def run_dqn_keras(program: str, settings: Settings, seed: int, q_network: keras.
     seconds = time.perf_counter() - start
     num_env_steps = sum(episode.steps for episode in run.episodes)
     greedy = greedy_returns(settings.environment, lambda states: np.argmax(run.q_network(states), axis=-1))
-    complete = run.rewards[~np.isnan(run.rewards)]  # num_steps cuts the last one short
+    complete = run.rewards[~np.isnan(run.rewards)]  # num_steps cuts the last episode short
     return make_record(program, settings, seed, num_env_steps, greedy, complete, seconds)
 
 
 def run_from_torch_start(program: str, settings: Settings, seed: int) -> Record:
-    """Does what `run_dqn_keras` does, from weights and biases that are distributed as in torch's Linear."""
+    """Does the same as `run_dqn_keras`, but starts with weights and biases distributed as in torch's Linear."""
     with gym.make(settings.environment) as env:
         q_network = make_q_network(env.observation_space.shape[0], int(env.action_space.n), settings.hidden_units)
     rng = np.random.default_rng(seed)
@@ -185,8 +185,8 @@ def run_from_torch_start(program: str, settings: Settings, seed: int) -> Record:
 
 def config_of(settings: Settings) -> Config:
     """Returns the settings as this package's Config; the learning rate is the optimizer's."""
-    # Stable-Baselines3 counts steps from 1 and ends with an update, after 50,176 steps of CartPole. Here, the step with
-    # that update is the one of index 50,176.
+    # Stable-Baselines3 counts steps from 1 and ends with an update, after 50,176 steps of CartPole. Here, that update
+    # comes at the step with index 50,176.
     num_steps = math.ceil(settings.num_steps / settings.steps_per_update) * settings.steps_per_update + 1
     # A target that is copied more often than Q changes is copied once per round of updates.
     steps_per_target = max(settings.steps_per_target, settings.steps_per_update)
@@ -234,7 +234,7 @@ def make_record(
     training_returns: list[float] | np.ndarray,
     seconds: float,
 ) -> Record:
-    """Returns the record of one run; seconds are those of training."""
+    """Returns the record of one run; `seconds` is the time of training."""
     greedy_return, greedy_return_10 = float(np.mean(greedy)), float(np.mean(greedy[:10]))
     training_return = float(np.mean(training_returns[-100:]))
     means = round(greedy_return, 3), round(greedy_return_10, 3), round(training_return, 3)
@@ -242,7 +242,7 @@ def make_record(
 
 
 class Program(NamedTuple):
-    """A program and the settings that it runs."""
+    """A program and its settings."""
 
     run: Callable[[str, Settings, int], Record]
     settings: tuple[Settings, ...]
@@ -288,7 +288,7 @@ A high p does not prove that the two are equal: with so few seeds, only large di
 
 
 def print_table(title: str, records: list[Record], measure: str) -> None:
-    """Prints the environments under one measure."""
+    """Prints the table of one measure, with a row for each environment."""
     print(
         f"{title}\n\n| | published | SB3 here | torch's start | p | Keras' start | p |\n|---|---|---|---|---|---|---|"
     )
@@ -303,7 +303,7 @@ def print_table(title: str, records: list[Record], measure: str) -> None:
 
 
 def print_cleanrl(returns: np.ndarray) -> None:
-    """Prints the one setting of CleanRL."""
+    """Prints the results for CleanRL's setting."""
     deviation = f"{np.std(returns, ddof=1):.1f}" if len(returns) > 1 else "-"
     print(f"""## CleanRL's CartPole-v1
 
@@ -330,13 +330,13 @@ DIFFERENCES = """## What is not the same
 
 
 def returns_of(records: list[Record], program: str, environment: str, measure: str) -> np.ndarray:
-    """Returns the measure for each seed."""
+    """Returns one measure for each seed."""
     chosen = [record for record in records if (record.program, record.environment) == (program, environment)]
     return np.array([getattr(record, measure) for record in chosen])
 
 
 def show(returns: np.ndarray) -> str:
-    """Returns mean, interval, median and number of the seeds as text."""
+    """Returns mean, interval and median over the seeds, and their number, as text."""
     if len(returns) == 0:
         return "-"
     low = high = math.nan
@@ -347,7 +347,7 @@ def show(returns: np.ndarray) -> str:
 
 
 def equality(first: np.ndarray, second: np.ndarray) -> str:
-    """Returns the p-values of two tests that two samples have one distribution, as text."""
+    """Returns, as text, the p-values of two tests that two samples have the same distribution."""
     if min(len(first), len(second)) < 2:
         return "-"
     u_test = scipy.stats.mannwhitneyu(first, second)

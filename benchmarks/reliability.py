@@ -1,8 +1,8 @@
-"""Nothing lost, nothing silent: training killed, stopped, starved and lied to, at full size.
+"""Tests at full size that nothing is lost or silent: kills, stops, full disks, damaged files and bad arguments.
 
     python -m benchmarks.reliability [--kills 120] > results/reliability.md
 
-The faults are in tests/helpers/faults.py and bad_configs.py; `make test` does the same at a small size. Linux only.
+The faults are in tests/helpers/faults.py and bad_configs.py; `make test` does the same at a smaller size. Linux only.
 """
 
 import argparse
@@ -36,7 +36,7 @@ from tests.helpers.long_runs import long_runs
 
 
 def bad_configs(number: int) -> dict[str, Any]:
-    """Refuse so many: each must be an error whose first word is the field, with the value in it."""
+    """Tries many bad fields: each must raise an error that begins with the field and shows the value."""
     tried: collections.Counter[str] = collections.Counter()
 
     @settings(max_examples=number, deadline=None, database=None, suppress_health_check=list(HealthCheck))
@@ -50,7 +50,7 @@ def bad_configs(number: int) -> dict[str, Any]:
 
 
 def kills_with_own_parts(folder: str, num_kills: int) -> dict[str, int]:
-    """Kill runs of six cases, ten kills of each run."""
+    """Kills runs of six cases, ten times each."""
     return faults.kill_campaign(folder, num_kills, num_kills // 4, cases=tuple(faults.OWN_PARTS))
 
 
@@ -66,7 +66,7 @@ def forgotten() -> dict[str, int]:
 
 
 def cost_of_checks() -> dict[str, str]:
-    """What the checks of every word of the environment take of an env step of training, in the Gymnasium loop."""
+    """Measures the share of the checks of the environment in an env step of training, in the Gymnasium loop."""
     env = gym.make("CartPole-v1")
     checked = CheckedEnv(env)
 
@@ -106,7 +106,7 @@ def cost_of_checks() -> dict[str, str]:
 
 
 def cost_of_compiled_checks(rounds: int = 30) -> dict[str, str]:
-    """The same for compiled episodes: their program with and without the checks, in turn."""
+    """Measures the same for compiled episodes: their program with and without the checks, in turn."""
     checks, config = compiled.is_all_finite, Config(num_episodes=10**6, epsilon=0.1, solved_reward=1e6)
     loops = []
     for is_all_finite in (checks, lambda *_: tf.constant(True)):
@@ -134,16 +134,16 @@ def cost_of_compiled_checks(rounds: int = 30) -> dict[str, str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=120, help="SIGKILLs, a quarter of them inside a save (120)")
-    parser.add_argument("--only", default="", metavar="TEXT", help="only the rows whose name has this text")
-    parser.add_argument("--own-kills", type=int, default=60, help="SIGKILLs of runs with own parts (60)")
-    parser.add_argument("--races", type=int, default=12, help="pairs of processes in one folder (12)")
-    parser.add_argument("--cases", type=int, default=2_500, help="calls of public functions (2,500)")
-    parser.add_argument("--signals", type=int, default=24, help="SIGINTs and SIGTERMs (24)")
-    parser.add_argument("--corruptions", type=int, default=5_000, help="corrupted checkpoints (5,000)")
-    parser.add_argument("--configs", type=int, default=2_000, help="bad Configs (2,000)")
+    parser.add_argument("--kills", type=int, default=120, help="number of SIGKILLs, a quarter of them in a save (120)")
+    parser.add_argument("--only", default="", metavar="TEXT", help="only the rows with this text in their name")
+    parser.add_argument("--own-kills", type=int, default=60, help="number of SIGKILLs of runs with own parts (60)")
+    parser.add_argument("--races", type=int, default=12, help="number of pairs of processes in one folder (12)")
+    parser.add_argument("--cases", type=int, default=2_500, help="number of calls of public functions (2,500)")
+    parser.add_argument("--signals", type=int, default=24, help="number of SIGINTs and SIGTERMs (24)")
+    parser.add_argument("--corruptions", type=int, default=5_000, help="number of corrupted checkpoints (5,000)")
+    parser.add_argument("--configs", type=int, default=2_000, help="number of bad Configs (2,000)")
     arguments = parser.parse_args()
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a background job; runs here are interrupted
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a background job; the runs here must be interruptible
         signal.signal(signal.SIGINT, signal.default_int_handler)
     versions = f"tensorflow {tf.__version__}, keras {keras.__version__}, gymnasium {gym.__version__}"
     print("# Nothing lost, nothing silent\n")

@@ -1,9 +1,9 @@
-"""How often, and when, the original's parameters solve CartPole-v1, in the Gymnasium loop: results/reproduction.md.
+"""Measures how often and when the original's parameters solve CartPole-v1 in the Gymnasium loop.
 
-python -m benchmarks.reproduction [--seeds 100]
+    python -m benchmarks.reproduction [--seeds 100]
 
-The seeds are 0, 1, 2, ...; each is trained as the notebook does it and then plays 100 greedy episodes. One process per
-core. The numbers follow from the seeds alone; nothing is left out.
+Writes results/reproduction.md. Each of the seeds 0, 1, 2, ... is trained as in the notebook and then plays 100 greedy
+episodes. One process per core. The numbers follow from the seeds alone; no seed is left out.
 """
 
 import argparse
@@ -85,7 +85,7 @@ def report(outcomes: list[Outcome]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=100, help="how many (100)")
+    parser.add_argument("--seeds", type=int, default=100, help="number of seeds (100)")
     num_seeds = parser.parse_args().seeds
     context = multiprocessing.get_context("spawn")
     cores = context.Queue()

@@ -1,9 +1,9 @@
-"""Do the compiled episodes and the Gymnasium loop learn alike? Episodes to solved of both, over many seeds.
+"""Measures whether compiled episodes and the Gymnasium loop learn alike: the episodes to solved over many seeds.
 
     python -m benchmarks.same_distribution [--seeds 50] > results/same_distribution.md
 
-The two loops draw different random numbers, so a seed gives two different runs; what must agree is the distribution.
-A run that is not solved counts as 2,000 episodes. Linux only (it keeps to one core).
+The two loops draw different random numbers, so a seed gives two different runs. Their distributions must agree. A run
+that is not solved counts as 2,000 episodes. Linux only (it uses a single core).
 """
 
 import argparse

@@ -1,14 +1,14 @@
-"""From nothing to "solved": the seconds of a fresh process, by their parts.
+"""Measures the seconds from the start of a process to "solved", part by part.
 
     python -m benchmarks.solve [--seeds 12] > results/solve.md
 
-Each seed trains in a process of its own, on one core, from the start of Python to the end of training; then the same
-seed once more in the same process, where nothing is left to compile: that is the training itself. (What compilation
-leaves to Python's garbage collector is collected in between.) Last, in the same way, a longer whole run: 400 episodes
-without a stop rule, some 50,000 env steps. A second process then does the same with the cache of compiled programs that
-the first one has filled, as the command line and notebooks do (`DQN_KERAS_CACHE`).
+Each seed has a fresh process on one core, timed from the start of Python to the end of training. The process then
+trains the same seed again, with nothing left to compile: that is the time of training itself. (Python's garbage
+collector runs in between, so that it does not count.) Last, it plays a longer run in the same way: 400 episodes without
+a stop rule, about 50,000 env steps. A second process does all this with the cache of compiled programs that the first
+one has filled, as the command line and notebooks do (`DQN_KERAS_CACHE`).
 
-Run it in an environment without the extra `benchmarks`, with the package alone.
+Run it in an environment with only the package, without the extra `benchmarks`.
 """
 
 import argparse
@@ -70,9 +70,9 @@ def main() -> None:
 
 
 def run_process(seed: int, cache: str) -> list[str]:
-    """Returns the seconds from the start of a process to solved, and what else the program prints."""
+    """Returns the seconds from the start of a process to solved, and the other numbers that it prints."""
     command, environment = [sys.executable, "-c", PROGRAM.format(seed=seed)], {**os.environ, "DQN_KERAS_CACHE": cache}
-    start = time.perf_counter()  # the clock is the machine's, for both processes
+    start = time.perf_counter()  # both processes read the machine's clock
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     solved, *others = done.stdout.split()
     return [str(float(solved) - start), *others]

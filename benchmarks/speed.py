@@ -1,15 +1,13 @@
-"""Env steps per second of the training loop, side by side with other ways to do the same.
+"""Measures the env steps per second of the training loop and of other programs that do the same.
 
     python -m benchmarks.speed [--rounds 9] > results/speed.md
 
 One process, one core, the same task for all: CartPole-v1, a 4-64-2 network, batch 64, an update every 4 env steps, a
-soft update with each, epsilon held at 0.1. The programs take turns, round by round, each for about the same time, so
-that a machine that slows down slows all of them; a ratio is the median over the rounds of the ratio within a round.
-Imports and compilation are outside the timed part; the time to the first update, which holds the compilation, is
-printed apart.
+soft update with each, epsilon fixed at 0.1. The programs take turns, round by round, each for about the same time, so
+that a machine that slows down slows all of them. A ratio is the median over the rounds of the ratio within a round.
+Imports and compilation are not timed. The time to the first update, which includes compilation, is printed separately.
 
-Left out are purejaxrl, which is not on PyPI, CleanRL, whose package there needs the old gym, and coax, which needs
-dm_control.
+Not included: purejaxrl (not on PyPI), CleanRL (its package on PyPI needs the old gym) and coax (needs dm_control).
 """
 
 import argparse
@@ -40,7 +38,7 @@ SEED = 0
 
 
 def gymnasium_loop() -> Callable[[int], int]:
-    """Return a function: play at least so many steps -> steps played. The other programs alike."""
+    """Returns a function that plays at least so many steps -> steps played; so do the functions below."""
     env = CheckedEnv(gym.make("CartPole-v1"))
     loop = episodes(env, make_agent((4,), 2, CONFIG, SEED), CONFIG)
 
@@ -68,7 +66,7 @@ def compiled_loop() -> Callable[[int], int]:
 
 
 def rejax() -> Callable[[int], int]:
-    """Four environments in parallel make its rhythm of one update per four env steps."""
+    """Plays four environments in parallel, which gives one update per four env steps."""
     import jax
     from flax import linen as nn
     from rejax import DQN
@@ -122,7 +120,7 @@ def stable_baselines3() -> Callable[[int], int]:
 
 
 def sbx() -> Callable[[int], int]:
-    """Stable-Baselines3's loop; the learning step is compiled by JAX."""
+    """Plays Stable-Baselines3's loop with a learning step that JAX compiles."""
     from sbx import DQN
 
     return _baseline(DQN)
@@ -156,8 +154,8 @@ def _baseline(algorithm: Any) -> Callable[[int], int]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=9, help="rounds that are timed (9)")
-    parser.add_argument("--seconds", type=float, default=1.5, help="about how long each program plays per round (1.5)")
+    parser.add_argument("--rounds", type=int, default=9, help="number of timed rounds (9)")
+    parser.add_argument("--seconds", type=float, default=1.5, help="approximate seconds per program and round (1.5)")
     arguments = parser.parse_args()
 
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

@@ -1,10 +1,9 @@
-"""What it looks like when a run does not learn: the pictures of the page "It does not learn", one per cause.
+"""Makes the pictures of the page "When it does not learn": one run for each cause.
 
     python -m benchmarks.symptoms > results/symptoms.md
 
-Every run is CartPole-v1 with the default parameters but for one thing that is wrong, seed 0; greedily it plays 20
-episodes. The pictures are
-`plot_run`'s, in results/symptoms/.
+Every run is CartPole-v1 with seed 0 and the default parameters, except for one mistake. After training, it plays 20
+greedy episodes. The pictures are made by `plot_run`, in results/symptoms/.
 """
 
 import importlib.metadata
@@ -21,7 +20,7 @@ FOLDER = Path(__file__).parent.parent / "results" / "symptoms"
 
 
 class EndsAsTruncations(gym.Wrapper):
-    """A common mistake: the pole falls, and the environment says `truncated`."""
+    """Makes a common mistake: when the pole falls, the environment returns `truncated`."""
 
     def step(self, action):
         state, reward, terminated, truncated, info = super().step(action)
@@ -29,7 +28,7 @@ class EndsAsTruncations(gym.Wrapper):
 
 
 class HugeObservations(gym.ObservationWrapper):
-    """Angles in thousandths of a degree, positions in millimetres."""
+    """Returns angles in thousandths of a degree and positions in millimetres."""
 
     def observation(self, observation):
         return (observation * np.array([1_000, 1_000, 57_296, 57_296])).astype(np.float32)

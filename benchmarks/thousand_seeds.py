@@ -1,10 +1,10 @@
-"""How reliable is the original's configuration? Its compiled run for many seeds, each to its own end, on all cores.
+"""Measures how reliable the original's configuration is: compiled runs of many seeds on all cores.
 
     python -m benchmarks.thousand_seeds --figure results/thousand_seeds.png > results/thousand_seeds.md
     python -m benchmarks.thousand_seeds --seeds 100
 
-The wall time is from the first line of this program: imports, worker processes and their compilation are in it. The
-speed with nothing left to compile is that of a hundred further seeds in the same workers.
+The wall time starts at the first line of this program, so it includes imports, worker processes and their compilation.
+The speed with nothing left to compile is measured on a hundred further seeds in the same workers.
 """
 
 import time
@@ -28,7 +28,7 @@ from dqn_keras.environments import CartPole
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=1_000, help="seeds 0, 1, ... (1,000)")
-    parser.add_argument("--figure", type=Path, help="a file for the picture")
+    parser.add_argument("--figure", type=Path, help="save the picture in this file")
     arguments = parser.parse_args()
 
     outcome = study(CartPole(), Config(), range(arguments.seeds))
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def table(outcome: Study) -> dict[str, str]:
-    """The figures that say how reliable it is."""
+    """Returns the figures that show how reliable it is."""
     episodes, num_seeds = outcome.episodes_to_solved, len(outcome.outcomes)
     summary = summarize(outcome)
     late = (episodes >= 500) & np.isfinite(outcome.solved_at)

@@ -1,12 +1,12 @@
 """Searches for settings that solve Acrobot or MountainCar, with Optuna.
 
-Acrobot's preset is the best of such a search, rounded. MountainCar's is not from this search: it was found by hand.
+Acrobot's preset has the best settings of such a search, rounded. MountainCar's preset was found by hand instead.
 
     python -m benchmarks.tune Acrobot-v1 --trials 40
     python -m benchmarks.tune MountainCar-v0 --trials 40
 
 A trial trains seeds 1000 to 1003, which benchmarks.presets does not use. It is scored by the mean greedy return of 100
-episodes after training, less a penalty for environment steps: one point for each 10,000.
+episodes after training, minus a penalty for environment steps: one point for each 10,000.
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """Deep Q-Network (DQN) in Keras on Gymnasium: a notebook's algorithm as a package.
 
-`__init__.pyi` lists the public names. Each is imported at its first use, because TensorFlow takes seconds to import and
-`dqn-keras --help` need not wait for it. `dqn_keras.learn` is the function; the module of the same name also holds its
-two parts: `from dqn_keras.learn import learn, loss_values, update_q_hat`.
+`__init__.pyi` lists the public names. Each is imported at its first use: TensorFlow takes seconds to import, and
+`dqn-keras --help` should not wait for it. `dqn_keras.learn` is the function; to import other names from the module
+`learn`, write `from dqn_keras.learn import learn, loss_values, update_q_hat`.
 """
 
 import lazy_loader

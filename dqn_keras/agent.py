@@ -1,4 +1,4 @@
-"""The agent: everything that a run changes."""
+"""The agent: all state that a run changes."""
 
 import contextlib
 import dataclasses
@@ -22,7 +22,7 @@ from dqn_keras.seeding import acting_rng, weights_seed
 
 @dataclasses.dataclass
 class Agent:
-    """The networks, and all other state that one episode passes on to the next."""
+    """The networks and all other state that a run keeps from one episode to the next."""
 
     seed: int
     q_network: keras.Sequential
@@ -32,9 +32,9 @@ class Agent:
     rng: np.random.Generator
     """Source of the random draws for acting and sampling in a gymnasium.Env."""
     epsilon: float
-    """Probability of a random action in the next episode; `policy.epsilon_at` gives that of a step."""
+    """Probability of a random action in the next episode; `policy.epsilon_at` gives the probability at one step."""
     episodes: list["Episode"] = dataclasses.field(default_factory=list)
-    """Records of the episodes so far; the length of the list is the number of the next episode."""
+    """Records of the episodes so far. The length of the list is the number of the next episode."""
     num_updates: int = 0
     """Number of gradient steps taken."""
 
@@ -66,9 +66,9 @@ def make_agent(
 ) -> Agent:
     """Returns an untrained agent.
 
-    Its weights and its random stream depend on `seed` alone; only a given `q_network` keeps its own weights. A given
-    network that its owner compiled learns with the owner's optimizer, unless `optimizer` is given; one that is not
-    compiled is compiled with `loss`. `some_states` [B, *S] are used to compare it with its copy.
+    Its weights and random numbers depend on `seed` alone, except that a given `q_network` keeps its own weights. If the
+    owner of `q_network` compiled it, that optimizer is used, unless `optimizer` is given. A network
+    that is not compiled is compiled here, with `loss`. `some_states` [B, *S] are used to compare it with its copy.
     """
     sizes = (*state_shape, *config.hidden_units, num_actions)
     is_default = q_network is None and optimizer is None and loss == "mse"
@@ -97,7 +97,7 @@ _compiled_with_our_adam: weakref.WeakKeyDictionary[keras.Model, keras.Optimizer]
 
 
 def owners_optimizer(q_network: keras.Model | None) -> keras.Optimizer | None:
-    """Returns the optimizer that the network's owner compiled it with; None if there is none but our own Adam."""
+    """Returns the optimizer that the network's owner compiled it with; None if there is none, or only our own Adam."""
     if q_network is None or not q_network.compiled or q_network.optimizer is _compiled_with_our_adam.get(q_network):
         return None
     return q_network.optimizer
@@ -121,7 +121,7 @@ def _optimizer_for(
 
 
 def keeps_averages(optimizer: keras.Optimizer) -> bool:
-    """Returns whether the optimizer averages the weights and replaces them by the averages at the end."""
+    """Returns whether the optimizer averages the weights and replaces them with the averages at the end."""
     return getattr(getattr(optimizer, "inner_optimizer", optimizer), "use_ema", False)
 
 

@@ -1,4 +1,4 @@
-"""Config: every number of the algorithm, in one place. Making a Config checks them."""
+"""The parameters of a run: every number of the algorithm in one place, checked when a Config is made."""
 
 import dataclasses
 from typing import Any, Literal
@@ -12,15 +12,15 @@ from dqn_keras.checks.numbers import check_choice, check_count, check_counts, ch
 class Config:
     """The parameters of a run. The defaults are the original notebook's.
 
-    The fields down to `jit_compile` are all that the original has. Those after it make the rhythm of other published
-    DQNs; their defaults leave the original's as it is.
+    The fields up to `jit_compile` describe the original. The fields after it allow the update schedules of other
+    published DQNs; their defaults keep the original's.
 
-    NumPy scalars become Python numbers. Every field is checked: a value of the wrong kind raises TypeError, a value
+    NumPy scalars become Python numbers. Every field is checked: a value of the wrong type raises TypeError, a value
     out of range raises ValueError. The message names the field, the range and the value.
     """
 
     memory_size: int = 50_000
-    """Number of transitions in the replay memory; when it is full, a new one replaces the oldest."""
+    """Number of transitions in the replay memory. When it is full, a new transition replaces the oldest."""
     steps_per_update: int = 4
     """Environment steps per update; with 4, an episode learns at its steps 0, 4, 8, ..."""
     alpha: float = 0.001
@@ -42,7 +42,7 @@ class Config:
     max_steps: int = 1_000
     """Maximum number of environment steps per episode."""
     solved_reward: float | None = 225.0
-    """Training stops when the mean reward of the last `solved_window` episodes is above this; None: it never does."""
+    """Training stops when the mean reward of the last `solved_window` episodes is above this. None: no stop rule."""
     solved_window: int = 50
     """Number of episodes in the mean for `solved_reward`; a run with fewer episodes does not count as solved."""
     hidden_units: tuple[int, ...] = (64,)
@@ -51,20 +51,20 @@ class Config:
     """Compile the learning step with XLA. Results are reproducible with and without it, but differ in the last bits."""
 
     num_steps: int | None = None
-    """Maximum number of environment steps of the run. The episode in which they end is cut short: its reward is NaN,
-    because it is not known. None: no limit but `num_episodes`."""
+    """Maximum number of environment steps of the run. An episode that this limit cuts short has the reward NaN, because
+    its full reward is unknown. None: only `num_episodes` limits the run."""
     learning_starts: int = 0
     """Environment steps before the first update, all with random actions (Mnih et al. 2015, "replay start size")."""
     steps_count_from: Literal["episode", "run"] = "episode"
-    """Where the count for `steps_per_update` begins: at 0 in each episode, or once, at the start of the run."""
+    """Where `steps_per_update` counts from: the start of each episode, or the start of the run."""
     gradient_steps: int = 1
-    """Gradient steps per update, each with a batch of its own."""
+    """Gradient steps per update, each on a new batch."""
     gradient_steps_per_target: int = 1
-    """Gradient steps from one change of Q-hat to the next (C in Mnih et al. 2015, algorithm 1). With tau=1, Q-hat is
-    then a copy of Q that stays as it is for so many steps."""
+    """Gradient steps from one update of Q-hat to the next (C in Mnih et al. 2015, algorithm 1). With tau=1, each of
+    these updates makes Q-hat a copy of Q."""
     epsilon_steps: int | None = None
-    """Environment steps of the run over which epsilon falls in a straight line from `epsilon` to `epsilon_min`. None:
-    epsilon falls from episode to episode, by `decay`."""
+    """Environment steps of the run over which epsilon falls linearly from `epsilon` to `epsilon_min`. None: epsilon is
+    multiplied by `decay` after each episode."""
 
     def __post_init__(self) -> None:
         for name in _COUNTS:
@@ -104,7 +104,7 @@ class Config:
         if self.epsilon_steps is not None and self.decay != Config.decay:
             raise ValueError(
                 f"decay must be left at its default of {Config.decay} with epsilon_steps={self.epsilon_steps}, "
-                f"by which epsilon falls in a straight line, got {self.decay}"
+                f"because epsilon then falls linearly, got {self.decay}"
             )
 
     def _set(self, name: str, value: Any) -> None:

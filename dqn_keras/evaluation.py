@@ -1,4 +1,4 @@
-"""Greedy episodes: how good a network is without exploration, after a run and during it."""
+"""Evaluation: how well a network plays without exploration, after a run or during it."""
 
 import math
 import os
@@ -26,13 +26,14 @@ def evaluate(
     seed: int | None = None,
     max_steps: int = 1_000,
 ) -> np.ndarray:
-    """Plays greedily without learning, and returns each episode's undiscounted return, [num_episodes] float64.
+    """Plays greedy episodes and returns the undiscounted return of each, [num_episodes] float64.
 
     Args:
         env: an environment, as for `train`. All episodes of a functional one are compiled into one call.
         q_network: a network, states [B, *S] -> Q-values [B, A].
         num_episodes: number of episodes.
-        seed: a whole number; None draws one. The start of episode k depends on (seed, k) alone; `train` never uses it.
+        seed: a whole number; None draws one. The start state of episode k depends on (seed, k) alone, and differs
+            from all start states in training.
         max_steps: maximum number of environment steps per episode.
 
     Raises:
@@ -64,38 +65,39 @@ def _spaces(env: gym.Env | FuncEnv) -> Spaces:
 class Evaluation(keras.callbacks.Callback):
     """Evaluates the network during a run and keeps the best one: a Keras callback for `train`.
 
-    `train` explores, and learns between the steps of an episode, so that its rewards belong to no network that could be
-    kept. This callback plays greedily in an environment of its own: at the start of the run, at the end of the first
-    episode at or after each multiple of `every_steps` environment steps, and at the end of the run. The seeds are the
+    `train` explores, and it learns between the steps of an episode. So an episode's reward does not measure any one
+    network. This callback plays greedily in its own environment: at the start of the run, after each episode in which
+    the number of environment steps reaches a multiple of `every_steps`, and at the end of the run. The seeds are the
     same each time, so that two evaluations differ only by their networks. Training gives the same result, bit for bit,
-    as without the callback. In compiled episodes, it makes each episode a call of its own, as most callbacks do.
+    as without the callback. With it, as with most callbacks, compiled episodes are played one at a time.
 
-    The mean return is logged as `greedy_return`: in `run.history`, and for all other callbacks, wherever they stand in
-    the list. An episode without an evaluation logs the mean return of the latest one, not NaN: a NaN that comes first
-    would stay the best value of Keras' callbacks. So `EarlyStopping("greedy_return", mode="max", patience=...)` counts
-    its patience in episodes. The evaluation at the end comes after the last episode's log.
+    The mean return is logged as `greedy_return`: in `run.history`, and for all other callbacks, wherever they are in
+    the list. An episode without an evaluation logs the latest mean return, not NaN, because Keras' callbacks would keep
+    a first NaN as their best value. So `EarlyStopping("greedy_return", mode="max", patience=...)` counts its
+    patience in episodes. The evaluation at the end comes after the last episode's log.
 
-    A resumed run evaluates the network in `best` first, and replaces it only by a better one. A new run replaces it.
+    A new run replaces the file `best`. A resumed run first evaluates the network in the file, and replaces it only with
+    a better one.
 
     Args:
-        env: an environment with the states and actions of the one that is trained in, but another object: wrappers and
-            environments may keep something from one episode to the next. (A functional environment may be the same.)
-        every_steps: environment steps of the run from one evaluation to the next.
-        num_episodes: number of episodes of an evaluation.
-        best: a .keras file for the network with the highest mean return, which `load_q_network` loads; of equal ones,
-            the earliest stays. The file is written whole or not at all. If it cannot be written during the run, a
-            warning says so and the run continues. None keeps no network.
+        env: a second environment with the same states and actions, not the object that `train` gets: wrappers and
+            environments may keep state from one episode to the next. (A functional environment may be the same object.)
+        every_steps: number of environment steps of the run between evaluations.
+        num_episodes: number of episodes per evaluation.
+        best: a .keras file for the network with the highest mean return, for `load_q_network`; of equal networks, the
+            first is kept. The file is written whole or not at all. If it cannot be written during the run, a warning
+            says so and the run continues. None keeps no network.
         seed: a whole number, as for `evaluate`; None draws one.
         max_steps: maximum number of environment steps per episode.
 
     Attributes:
-        steps: environment steps of the run at each evaluation, from where the run began or was resumed.
+        steps: environment steps of the run at each evaluation since `train` was called.
         returns: mean return of each evaluation, undiscounted.
         best_return: mean return of the network in `best`; without a file, the highest so far.
 
     Raises:
         TypeError, ValueError: an argument is not supported. From `train`: the environment does not fit, the network
-            cannot be saved, or `best` holds another network than one of the run that is resumed.
+            cannot be saved, or `best` holds a network that is not from the resumed run.
     """
 
     def __init__(
@@ -117,7 +119,7 @@ class Evaluation(keras.callbacks.Callback):
         if self.best is not None and self.best.suffix != ".keras":
             raise ValueError(f"best must end in .keras, got {shown(str(best))}")
         self.seed, self.max_steps = checked_seed(seed), check_count("max_steps", max_steps)
-        self.num_steps = 0  # environment steps of the run; `train` sets those that a resumed run has behind it
+        self.num_steps = 0  # environment steps of the run; `train` sets the number that a resumed run begins with
         self.steps: list[int] = []
         self.returns: list[float] = []
         self.best_return = -math.inf
@@ -130,7 +132,7 @@ class Evaluation(keras.callbacks.Callback):
                 self.best_return = self._mean_return(load_q_network(self.best))
             except ValueError as error:
                 raise ValueError(
-                    f"best {self.best} must hold a network of the run that is resumed, or not exist: {error}"
+                    f"best {self.best} must hold a network of the resumed run, or not exist: {error}"
                 ) from error
         self._evaluate()
 
@@ -159,7 +161,7 @@ class Evaluation(keras.callbacks.Callback):
             self.best_return = mean_return
 
     def _mean_return(self, q_network: keras.Model) -> float:
-        """Returns the mean return of a network, whose own state (such as the seed of a noisy layer) stays as it was."""
+        """Returns the mean return of a network and restores the network's state, such as the seed of a noisy layer."""
         variables = q_network.non_trainable_variables
         before = [variable.numpy() for variable in variables]
         try:
@@ -177,7 +179,7 @@ class Evaluation(keras.callbacks.Callback):
         except OSError as error:
             if len(self.returns) == 1:
                 raise OSError(f"best {self.best} cannot be written: {error}") from error
-            warnings.warn(f"best {self.best} could not be written ({error}); the last one stays", stacklevel=2)
+            warnings.warn(f"best {self.best} could not be written ({error}); the earlier file stays", stacklevel=2)
             return False
         return True
 

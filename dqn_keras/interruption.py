@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as requests to stop at a safe point, instead of exceptions at any point."""
+"""Interruption: Ctrl-C and SIGTERM stop a run at a safe point, instead of raising an exception at any point."""
 
 import contextlib
 import signal
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 class TrainingInterrupted(KeyboardInterrupt):
     """Raised by `train` at the end of an episode, after Ctrl-C, an interrupted notebook cell or SIGTERM.
 
-    It is a KeyboardInterrupt, so that it also ends the loop or the script around `train`.
+    It is a KeyboardInterrupt, so it also ends a loop or a script around `train`.
     """
 
     run: "Run"
@@ -25,7 +25,7 @@ class TrainingInterrupted(KeyboardInterrupt):
         self.run, self._folder = run, folder
 
     def __reduce__(self) -> tuple:
-        return KeyboardInterrupt, (str(self),)  # a run that is sent to another process would lose its optimizer's state
+        return KeyboardInterrupt, (str(self),)  # pickling the run would lose its optimizer's state
 
     def __str__(self) -> str:
         after = f"after {len(self.run.episodes)} episodes"
@@ -37,7 +37,7 @@ class TrainingInterrupted(KeyboardInterrupt):
 
 
 class _Requests:
-    """A handler that notes the first signal, and raises KeyboardInterrupt at the second."""
+    """A signal handler that notes the first signal and raises KeyboardInterrupt at the second."""
 
     def __init__(self) -> None:
         self.signals: list[int] = []
@@ -52,8 +52,8 @@ class _Requests:
 def stop_requests() -> Iterator[Callable[[], bool]]:
     """Yields a function that returns whether Ctrl-C or SIGTERM has come. A second one raises KeyboardInterrupt at once.
 
-    Interrupting a notebook cell is a Ctrl-C. Handlers that other code has set stay in place. Python handles signals in
-    the main thread alone, so in another thread the function always returns False.
+    Interrupting a notebook cell counts as Ctrl-C. Handlers that other code has set stay in place. Python handles
+    signals only in the main thread, so in another thread the function always returns False.
     """
     requests = _Requests()
     with _handled_by(requests, signal.SIGINT, signal.SIGTERM):
@@ -67,7 +67,7 @@ def sigterm_interrupts() -> contextlib.AbstractContextManager[None]:
 
 @contextlib.contextmanager
 def _handled_by(handler: Callable, *numbers: int) -> Iterator[None]:
-    """Sets the handler of these signals, unless other code than `train` has set one; restores it at the end."""
+    """Sets the handler of these signals, unless other code has set one; restores the earlier handler at the end."""
     previous = {}
     if threading.current_thread() is threading.main_thread():
         for number in numbers:

@@ -29,7 +29,7 @@ def td_targets(experiences: Experience, gamma: Any, q_network: keras.Model, q_ha
             terminal_states [B] (1 or 0); NumPy arrays or tensors.
         gamma: discount factor per step, in [0, 1].
         q_network: states [B, *S] -> Q-values [B, A]; a built Sequential or functional model. Not used here.
-        q_hat_network: a network of the same form, which gives Q_hat.
+        q_hat_network: a network with the same input and output, which gives Q_hat.
 
     Returns:
         The targets y, [B] float32.
@@ -62,7 +62,7 @@ def double_td_targets(
 def loss_values(experiences: Experience, gamma: Any, q_network: keras.Model, q_hat_network: keras.Model) -> tf.Tensor:
     """Returns the original's loss of a batch, a scalar: the mean squared TD error, mean of (y - Q(s, a))^2.
 
-    `td_targets` gives y; arguments and errors are the same as its own.
+    `td_targets` gives y. Arguments and errors are as in `td_targets`.
     """
     y_targets = td_targets(experiences, gamma, q_network, q_hat_network)  # [B]
     q_values = tf.gather(q_network(experiences.state), experiences.action, batch_dims=1)  # [B]
@@ -70,7 +70,16 @@ def loss_values(experiences: Experience, gamma: Any, q_network: keras.Model, q_h
 
 
 def update_q_hat(q_network: keras.Model, q_hat_network: keras.Model, tau: Any = 0.01) -> None:
-    """Moves Q-hat's weights a little towards Q's: theta_hat <- tau theta + (1 - tau) theta_hat."""
+    """Moves Q-hat's weights a little towards Q's: theta_hat <- tau theta + (1 - tau) theta_hat.
+
+    Args:
+        q_network: the network Q.
+        q_hat_network: a second network with weights of the same shapes; changed in place.
+        tau: share of Q, in [0, 1].
+
+    Raises:
+        TypeError, ValueError: the networks do not match, or `tau` is not in [0, 1].
+    """
     check_pair(q_network, q_hat_network)
     tau = as_share("tau", tau)
     for q_weights, q_hat_weights in zip(q_network.weights, q_hat_network.weights, strict=True):
@@ -82,13 +91,13 @@ DEFAULT_FORMULAS = Formulas(td_targets, "mse")
 
 
 def packages(formulas: Formulas) -> Formulas | None:
-    """Returns the formulas if they are this package's and Keras', which never change in a process; else None."""
+    """Returns the formulas if they are the package's or Keras' own, which never change in a process; else None."""
     are_known = any(formulas.targets is x for x in (td_targets, double_td_targets)) and isinstance(formulas.loss, str)
     return formulas if are_known else None
 
 
 class Metrics(NamedTuple):
-    """Measurements on the batch of an update, made before the update; float32 scalars."""
+    """Metrics of an update, measured on its batch before the update; float32 scalars."""
 
     loss: Any
     """Loss of the batch, including the network's regularization losses."""
@@ -154,7 +163,7 @@ def learn(
         q_network: a built Sequential or functional model, states [B, *S] -> Q-values [B, A] float32; changed in place.
             Its layers are called in inference mode, and its regularization losses are added to the loss.
         q_hat_network: a second network with weights of the same shapes; changed in place.
-        optimizer: any Keras optimizer; it is built here if necessary.
+        optimizer: any Keras optimizer; `learn` builds it if necessary.
         tau: share of Q in the soft update, in [0, 1].
         targets: a function like `td_targets`: (experiences, gamma, q_network, q_hat_network) -> y [B]. No gradient
             flows through it.
@@ -167,7 +176,7 @@ def learn(
 
     Raises:
         TypeError, ValueError: a shape or dtype is wrong, an action does not exist, a number is not finite, or the
-            networks do not match. Nothing has changed then.
+            networks do not match. Nothing is changed in that case.
     """
     check_network("q_network", q_network)
     check_network("q_hat_network", q_hat_network)
@@ -186,7 +195,7 @@ def learn(
 
 
 def _make_step(formulas: Formulas, learner: Learner) -> Callable[..., tf.Tensor]:
-    """Returns `gradient_step` as a function of tensors alone: the five of a batch, gamma, tau -> the loss."""
+    """Returns `gradient_step` as a function of tensors only: the five fields of a batch, gamma, tau -> the loss."""
 
     def step(*tensors: tf.Tensor) -> tf.Tensor:
         *batch, gamma, tau = tensors

@@ -1,4 +1,4 @@
-"""Metrics: the record of an episode, and the values that are logged."""
+"""Metrics: the record of an episode and the logged values."""
 
 import math
 from collections import deque
@@ -19,7 +19,7 @@ class Episode(NamedTuple):
     """Undiscounted sum of its rewards; NaN if `num_steps` cut the episode short."""
     steps: int
     epsilon: float
-    """Probability of a random action in it; at its first step, if it falls from step to step."""
+    """Probability of a random action; if it changes within the episode, its value at the first step."""
     loss: float
     """Mean loss over its updates. This and the next three are NaN if it had no updates."""
     mean_q: float
@@ -31,7 +31,7 @@ class Episode(NamedTuple):
     max_reward: float
     """Highest reward of a single step."""
     terminated: bool
-    """Whether the environment terminated it; False after a time limit."""
+    """Whether the environment terminated the episode; False after a time limit."""
 
 
 class Outcome(NamedTuple):
@@ -49,19 +49,19 @@ class Outcome(NamedTuple):
     seconds: float
     """Time that the training took, without the evaluation."""
     digest: bytes
-    """SHA-256 of the final weights of both networks: equal if all bits are equal."""
+    """SHA-256 of the final weights of both networks; equal if the weights are equal, bit for bit."""
 
 
 LOGGED = {
     "reward": "Undiscounted sum of the episode's rewards; NaN if `num_steps` cut the episode short.",
-    "average_reward": "Mean reward of the last `solved_window` episodes; of fewer at the start.",
+    "average_reward": "Mean reward of the last `solved_window` episodes, or of all so far if they are fewer.",
     "steps": "Number of environment steps.",
-    "epsilon": "Probability of a random action; at the episode's first step, if it falls from step to step.",
-    "loss": "Mean loss over the episode's updates. It, mean_q, max_q and td_error are NaN before the first update.",
+    "epsilon": "Probability of a random action; at the first step, if it changes within the episode.",
+    "loss": "Mean loss over the episode's updates. Without one, loss, mean_q, max_q and td_error are NaN.",
     "mean_q": "Mean over the episode's batches of max_a Q(s, a).",
     "max_q": "Highest Q-value in the episode's batches.",
-    "q_bound": "Highest possible return if no reward exceeds the highest so far, r_max: r_max / (1 - gamma), for r_max "
-    "at every step. If r_max is negative, it is r_max, for one step and then the end.",
+    "q_bound": "Highest possible return if no reward exceeds the highest so far, r_max. It is r_max / (1 - gamma), the "
+    "return of r_max at every step; if r_max is negative, it is r_max, the return of a single step.",
     "td_error": "Mean over the episode's batches of |y - Q(s, a)|.",
     "terminal_share": "Share of terminal transitions in the memory.",
     "steps_per_second": "Environment steps per second, learning included; NaN for episodes from before a resume.",
@@ -89,7 +89,7 @@ class Log:
         self._memory.append((episode.steps, episode.terminated))
         self._steps += episode.steps
         self._terminated += episode.terminated
-        while self._steps - self._memory[0][0] >= config.memory_size:  # the oldest has none left
+        while self._steps - self._memory[0][0] >= config.memory_size:  # no transition of the oldest is left
             steps, terminated = self._memory.popleft()
             self._steps -= steps
             self._terminated -= terminated

@@ -1,4 +1,4 @@
-"""The two networks: Q, which learns, and Q-hat, its slow copy, which gives the targets."""
+"""The two networks: Q learns, and Q-hat, its slow copy, gives the targets."""
 
 from collections.abc import Sequence
 
@@ -18,9 +18,9 @@ def make_q_network(
 ) -> keras.Sequential:
     """Returns a feed-forward Q-network: states [B, num_features] -> Q-values [B, num_actions], float32.
 
-    Hidden layers use ReLU; the output is linear. Kernels start Glorot uniform (Keras' default), drawn from `seed`
-    without touching any global random state: a whole number, a SeedSequence, or None for a random one. Biases start at
-    zero.
+    Hidden layers use ReLU; the output is linear. Kernels start Glorot uniform (Keras' default), biases at zero. `seed`
+    (a whole number, a SeedSequence, or None for a random one) determines the kernels. No global random state is read or
+    set.
     """
     num_features, num_actions = check_count("num_features", num_features), check_count("num_actions", num_actions)
     hidden_units = check_counts("hidden_units", hidden_units)
@@ -49,7 +49,7 @@ def _initializers(num_layers: int, seed: int | np.random.SeedSequence | None) ->
 
 
 def start_weights(network: keras.Sequential, seed: int | np.random.SeedSequence | None) -> list[tf.Tensor]:
-    """Returns the weights that a new network for `seed`, of the sizes of this one of `make_q_network`, starts with."""
+    """Returns the initial weights that `make_q_network` gives a network of these sizes for `seed`."""
     weights = []
     for layer, initializer in zip(network.layers, _initializers(len(network.layers), seed), strict=True):
         weights += [initializer(layer.kernel.shape), tf.zeros([layer.units])]
@@ -62,7 +62,7 @@ def make_networks(
     hidden_units: Sequence[int] = (64,),
     seed: int | np.random.SeedSequence | None = None,
 ) -> tuple[keras.Sequential, keras.Sequential]:
-    """Returns Q and Q-hat: two networks of the same shape, with equal weights."""
+    """Returns Q and Q-hat: two networks of `make_q_network` with equal weights."""
     q_network = make_q_network(num_features, num_actions, hidden_units, seed)
     q_hat_network = make_q_network(num_features, num_actions, hidden_units, seed, name="q_hat_network")
     q_hat_network.set_weights(q_network.get_weights())

@@ -1,4 +1,4 @@
-"""Pictures: learning curves of one run and of many, and the Q-values of a network."""
+"""Plots: learning curves of one run or of many, and the Q-values of a network."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -26,12 +26,12 @@ from dqn_keras.training import Run
 
 
 def plot_rewards(rewards: Sequence[float] | np.ndarray, ax: Axes | None = None, window: int = 20) -> Axes:
-    """Plots each episode's reward, and the mean of the last `window` episodes, starting when there are that many.
+    """Plots the reward of each episode and the moving average over `window` episodes.
 
     Args:
         rewards: one reward for each episode, [num_episodes], such as `run.rewards`.
-        ax: the Axes to draw in; by default those of a new figure, 10 by 5 inches.
-        window: number of episodes in the moving average.
+        ax: the Axes to draw in; by default, a new figure of 10 by 5 inches.
+        window: number of episodes in the moving average, which starts when there are so many.
     """
     window = check_count("window", window)
     rewards = check_array("rewards", rewards, num_axes=1).astype(np.float64)
@@ -53,8 +53,8 @@ def plot_rewards(rewards: Sequence[float] | np.ndarray, ax: Axes | None = None, 
 def plot_run(run: Run, speed: bool = True) -> np.ndarray:
     """Plots a run at a glance: its rewards, and below them Q-values, TD error, terminal transitions and speed.
 
-    Q-values above their bound are overestimated. The documentation says what else to look for, in "It does not learn".
-    Returns the Axes in the order above; `plot_run(run)[0].figure` is the figure, 10 inches wide.
+    Q-values above their bound are overestimated. The page "When it does not learn" of the documentation says what else
+    to look for. Returns the Axes in the order above; `plot_run(run)[0].figure` is the figure, 10 inches wide.
 
     Args:
         run: the result of `train`.
@@ -65,7 +65,7 @@ def plot_run(run: Run, speed: bool = True) -> np.ndarray:
 
 
 def plot_history(history: Mapping[str, Sequence[float]], config: Config, speed: bool = True) -> np.ndarray:
-    """Plots a run as `plot_run` does, from `run.history` alone or from the columns of a log file."""
+    """Does the same as `plot_run`, but takes `run.history` or the columns of a log file."""
     speed = check_flag("speed", speed)
     columns = {name: np.asarray(values, np.float64) for name, values in history.items()}
     num_rows, num_columns = (2, 2) if speed else (1, 3)
@@ -106,17 +106,17 @@ def plot_q(
     ax: Axes | None = None,
     limits: tuple[float, float] | None = None,
 ) -> Axes:
-    """Plots the Q-values of a network over two entries of the state, in which all other entries are fixed.
+    """Plots the Q-values of a network over two entries of the state; all other entries are fixed.
 
-    The colour is max_a Q(s, a). The hatching is the greedy action: none for action 0, lines for action 1, and another
-    kind for each further action up to 7; after that, the kinds repeat.
+    The colour shows max_a Q(s, a). The hatching shows the greedy action: none for action 0, lines for action 1, and
+    another kind for each further action up to 7; after that, the kinds repeat.
 
     Args:
-        q_network: a network of states that are vectors: [B, N] -> Q-values [B, A].
+        q_network: a network that takes vectors: states [B, N] -> Q-values [B, A].
         x: the entry of the state along the x-axis: its index, its lowest and its highest value.
         y: the entry along the y-axis, in the same form.
         state: the values of the other entries, [N]; by default, they are 0.
-        ax: the Axes to draw in; by default those of a new figure, 6 by 4.5 inches, with a colour bar.
+        ax: the Axes to draw in; by default, a new figure of 6 by 4.5 inches with a colour bar.
         limits: the Q-values of the darkest and the brightest colour; by default, the lowest and the highest plotted.
 
     Raises:
@@ -128,7 +128,7 @@ def plot_q(
     num_features = q_network.input_shape[-1]
     state = check_array("state", np.zeros(num_features) if state is None else state, num_axes=1)
     if state.shape != (num_features,):
-        raise ValueError(f"state must have {num_features} entries, as q_network takes them, got {state.shape[0]}")
+        raise ValueError(f"state must have {num_features} entries, the input size of q_network, got {state.shape[0]}")
     if not np.isfinite(state).all():
         raise ValueError(f"state must be finite, got {shown(state)}")
     limits = None if limits is None else _limits(limits)
@@ -142,7 +142,7 @@ def plot_q(
 
 
 def _entry(name: str, entry: Any, num_features: int) -> tuple[int, np.ndarray]:
-    """Returns the index of an entry of the state, and 61 values of it."""
+    """Returns the index of an entry of the state and 61 values for it."""
     values = check_sequence(name, entry, "an index and two values")
     if len(values) != 3:
         raise ValueError(f"{name} must be an index, a lowest and a highest value, got {shown(entry)}")
@@ -192,16 +192,16 @@ def plot_study(
     published: float | None = 293,
     x: Literal["episodes", "env_steps"] = "episodes",
 ) -> np.ndarray:
-    """Plots many seeds in three pictures: the learning curves, when they are solved, and the share solved by then.
+    """Plots a study in three panels: learning curves, episodes to solved, and share of seeds solved by episode.
 
-    Without a stop rule (`solved_reward=None`), the last two show the rewards at the end of the runs instead.
+    Without a stop rule (`solved_reward=None`), the last two panels show the rewards at the end of the runs.
 
     Args:
         study: a study with any number of seeds.
-        axes: the three Axes to draw in; by default those of a new figure, 15 by 4.5 inches.
-        published: an episode to mark: how many one published run needed, such as the original's 293. None marks
+        axes: the three Axes to draw in; by default, a new figure of 15 by 4.5 inches.
+        published: the episodes that one published run needed, such as the original's 293, to mark them; None marks
             nothing.
-        x: what runs are measured in: episodes, or environment steps.
+        x: the unit of the x-axes: "episodes" or "env_steps".
     """
     check_instance("study", study, Study, "a Study")
     if published is not None:
@@ -239,16 +239,16 @@ def plot_study(
 
 
 def _curves(study: Study, until: int, is_steps: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Returns places on the x-axis [N], and the mean of each seed's last rewards there [S, N].
+    """Returns points on the x-axis [N], and the mean of each seed's last rewards at these points [S, N].
 
-    After its end, a run keeps its last mean.
+    After the end of a run, its last mean continues.
     """
     window = study.config.solved_window
     longest = max(len(outcome.rewards) for outcome in study.outcomes)
     places = np.linspace(0, until, 500) if is_steps else np.arange(window - 1, min(until, longest))
     rows = []
     for outcome in study.outcomes:
-        rewards = outcome.rewards[np.isfinite(outcome.rewards)]  # all but an episode that is cut short
+        rewards = outcome.rewards[np.isfinite(outcome.rewards)]  # without an episode that is cut short
         mean = np.convolve(rewards, np.full(window, 1 / window), mode="valid")
         at = outcome.steps.cumsum()[window - 1 : len(rewards)] if is_steps else np.arange(window - 1, len(rewards))
         rows.append(np.interp(places, at, mean, left=np.nan))
@@ -266,7 +266,7 @@ def _plot_solved(
     distribution: Axes,
     shares: Axes,
 ) -> None:
-    """Plots when the seeds are solved, as a histogram and as the share solved by then."""
+    """Plots when the seeds are solved, as a histogram and as a cumulative share."""
     config, num_seeds = study.config, len(study.outcomes)
     solved = np.sort(ends[np.isfinite(study.solved_at)])
     most = (config.num_steps or config.num_episodes * config.max_steps) if is_steps else config.num_episodes
@@ -293,7 +293,7 @@ def _plot_solved(
 
 
 def _plot_ends(means: np.ndarray, window: int, distribution: Axes, shares: Axes) -> None:
-    """Plots the mean rewards at the end of runs without a stop rule, as a histogram and as a distribution function."""
+    """Plots the mean rewards at the end of runs without a stop rule, as a histogram and as a cumulative share."""
     label = f"Mean reward of the last {window} episodes"
     distribution.hist(means, bins=40, color="tab:blue", alpha=0.7)
     distribution.axvline(np.median(means), color="tab:blue", linewidth=2, label="median")
@@ -305,7 +305,7 @@ def _plot_ends(means: np.ndarray, window: int, distribution: Axes, shares: Axes)
 
 
 def plot_sweep(sweep: Sweep, late_after: int = 500) -> np.ndarray:
-    """Plots the settings of a sweep side by side: a dot and a 95 % interval for each statistic of each setting.
+    """Plots the settings of a sweep side by side: a dot and a 95 % interval for each setting and statistic.
 
     The statistics are the share of seeds that are late or never solved, the median of the episodes to solved, and, with
     `evaluate_on`, the greedy return. Returns the Axes; `plot_sweep(sweep)[0].figure` is the figure.

@@ -12,12 +12,12 @@ def action(q_values: np.ndarray, epsilon: float, rng: np.random.Generator) -> in
     """Chooses a random action with probability `epsilon`, else the action with the highest Q-value.
 
     Args:
-        q_values: Q(s, .) of one state, [A] or [1, A], none of them NaN; an array or a tensor.
+        q_values: Q(s, .) of one state, [A] or [1, A], without NaN; an array or a tensor.
         epsilon: probability of a random action, in [0, 1].
         rng: the random generator. One draw, `random()`, decides; a random action takes a second draw, `integers(A)`.
 
     Returns:
-        The action's index, 0 <= a < A. If several Q-values are highest, it is the first of them.
+        The action's index, 0 <= a < A. Of several highest Q-values, the first is chosen.
 
     Raises:
         TypeError, ValueError: an argument is wrong; the message names it.
@@ -27,7 +27,7 @@ def action(q_values: np.ndarray, epsilon: float, rng: np.random.Generator) -> in
 
 
 def epsilon_greedy(q_values: np.ndarray, epsilon: float, rng: np.random.Generator) -> int:
-    """Does what `action` does, without checks: for training, where it runs at every step."""
+    """Does the same as `action`, without checks, because training calls it at every step."""
     if rng.random() < epsilon:
         return int(rng.integers(q_values.shape[-1]))
     return int(q_values.argmax())
@@ -37,7 +37,7 @@ def _one_states(q_values: Any) -> np.ndarray:
     """Returns the Q-values of one state as an array [A]."""
     array = check_array("q_values", q_values)
     if array.shape not in ((array.size,), (1, array.size)) or not array.size:
-        raise ValueError(f"q_values must be those of one state, [A] or [1, A], got shape {array.shape}")
+        raise ValueError(f"q_values must be the values of one state, [A] or [1, A], got shape {array.shape}")
     if np.isnan(array).any():
         raise ValueError(f"q_values must not be NaN, got {shown(q_values)}")
     return array.reshape(-1)
@@ -51,15 +51,15 @@ def decay_epsilon(epsilon: float, config: Config) -> float:
 
 
 def epsilon_of_next_episode(epsilon: float, config: Config) -> float:
-    """Does what `decay_epsilon` does, without checks; with `epsilon_steps`, epsilon does not change here."""
+    """Does the same as `decay_epsilon`, without checks; with `epsilon_steps`, returns epsilon unchanged."""
     return epsilon if config.epsilon_steps is not None else max(epsilon * config.decay, config.epsilon_min)
 
 
 def epsilon_at(step: int, epsilon: float, config: Config) -> float:
     """Returns the probability of a random action at one environment step of the run, counted from 0.
 
-    It is 1 before `learning_starts`, then on the straight line of `epsilon_steps`; without that, it is `epsilon`, the
-    value of the whole episode.
+    It is 1 before `learning_starts`. After that, it falls linearly with `epsilon_steps`; without `epsilon_steps`, it is
+    `epsilon`, the value of the whole episode.
     """
     if step < config.learning_starts:
         return 1.0

@@ -1,4 +1,4 @@
-"""Settings that work, for each environment by its own threshold. results/presets.md says how they were measured."""
+"""Settings that solve an environment by its own threshold. results/presets.md says how they were measured."""
 
 from dqn_keras.config import Config
 
@@ -45,5 +45,5 @@ presets: dict[str, Config] = {
         solved_window=100,
     ),
 }
-"""For the id of an environment, parameters that solve it: `train(gymnasium.make(id), presets[id])`. Solved means, as by
+"""Parameters that solve an environment, by its id: `train(gymnasium.make(id), presets[id])`. Solved means, as in
 Gymnasium, that the mean reward of 100 episodes is above the environment's `reward_threshold`."""

@@ -20,7 +20,7 @@ __all__ = ["Progress", "tqdm"]
 
 
 class Progress:
-    """The lines that the original prints; with `verbose` 2, also a progress bar."""
+    """Prints the same lines as the original; with `verbose` 2, also shows a progress bar."""
 
     def __init__(self, run: "Run", verbose: int) -> None:
         self._run, self._verbose = run, verbose
@@ -37,7 +37,7 @@ class Progress:
         self._bar.close()
 
     def show(self, episode: Episode) -> None:
-        """Moves the bar; every 100 episodes, also prints the last reward and the average of the last 100."""
+        """Moves the bar. Every 100 episodes, also prints the last reward and the average of the last 100."""
         self._bar.update(episode.steps if self._counts_steps else 1)
         if self._verbose and episode.number % 100 == 0 and not math.isnan(episode.reward):
             last = [e.reward for e in self._run.episodes[max(0, episode.number - 99) : episode.number + 1]]
@@ -46,7 +46,7 @@ class Progress:
             say(f"Episode {episode.number}, Reward: {episode.reward}, Last 100 Average: {average}")
 
     def show_end(self) -> None:
-        """Prints whether the run is solved."""
+        """Prints a line if the run is solved."""
         run = self._run
         if self._verbose and run.solved_at is not None:
             average = round(float(np.mean(run.rewards[-run.config.solved_window :])), 2)

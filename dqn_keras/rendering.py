@@ -1,4 +1,4 @@
-"""Frames of an episode, and an animation made of them: without a window, a display or a video encoder."""
+"""Rendering: the frames of an episode, and an animation of them, without a window, a display or a video encoder."""
 
 import io
 import os
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def record_episode(
     env: gym.Env, q_network: keras.Model, seed: int | None = None, max_steps: int = 1_000
 ) -> list[np.ndarray]:
-    """Plays one greedy episode and returns a frame [H, W, 3] uint8 of every state, including the first and the last.
+    """Plays one greedy episode and returns a frame [H, W, 3] uint8 of every state, the first and the last included.
 
     It is the first episode of `evaluate(env, q_network, seed=seed)`. The environment must be made with
     `render_mode="rgb_array"`, which needs no display; otherwise ValueError is raised.
@@ -93,7 +93,7 @@ def _check_frames(frames: Any) -> list[np.ndarray]:
 
 
 def _check_target(file: Any, format: Any) -> tuple[Any, str]:
-    """Returns a path or an open binary file, and the format in which to write there."""
+    """Returns the path or open binary file, and the format to write in."""
     is_open = hasattr(file, "write") and not isinstance(file, io.TextIOBase | type)
     if not (is_open or isinstance(file, str | os.PathLike)):
         raise TypeError(f"file must be a path or an open binary file, got {shown(file)}")
@@ -110,7 +110,7 @@ _FORMATS = ("PNG", "GIF")
 
 
 def animate(frames: Sequence[np.ndarray], fps: int = 50, width: int = 300) -> "IPython.display.Image":
-    """Returns the animation for a notebook: an animated PNG, stored in the .ipynb, that any browser plays."""
+    """Returns an animation for a notebook: an animated PNG that is stored in the .ipynb and plays in any browser."""
     try:
         from IPython.display import Image as InlineImage  # only notebooks need it
     except ImportError as error:

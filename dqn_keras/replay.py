@@ -1,4 +1,4 @@
-"""The replay memory: the last transitions, from which every update draws a random batch.
+"""The replay memory: it keeps the last transitions, and every update draws a random batch from it.
 
 Successive transitions are strongly correlated, but a gradient step needs independent samples. Random draws from a
 memory break the correlation, and a transition can be used in more than one update (Mnih et al. 2015).
@@ -33,11 +33,11 @@ class Experience(NamedTuple):
 class ReplayMemory:
     """The last `memory_size` transitions, in a ring buffer that is allocated once.
 
-    The loop of Gymnasium's environments uses `append_unchecked` and `sample_rows`. Compiled episodes write and draw the
-    same rows inside their program (`loops/compiled.py`).
+    The Gymnasium loop uses `append_unchecked` and `sample_rows`. Compiled episodes write and draw the same rows inside
+    their program (`loops/compiled.py`).
 
-    One transition is one row: state, next_state, then action, reward and terminal_state as float32. So a batch is drawn
-    and passed to TensorFlow as one array. float32 holds an action's index exactly up to 2^24.
+    One transition is one row: state, next_state, then action, reward and terminal_state as float32. A batch is
+    therefore one array, both when it is drawn and when TensorFlow gets it. float32 is exact for actions up to 2^24.
 
     Args:
         memory_size: number of transitions.
@@ -55,7 +55,7 @@ class ReplayMemory:
         size = math.prod(self.state_shape)
         self.rows = np.zeros((memory_size, 2 * size + 12 // np.dtype(dtype).itemsize), dtype)
         self.num_appended = 0
-        """Number of all transitions appended so far; the next one goes to row `num_appended % memory_size`."""
+        """Number of transitions appended so far. The next one goes to row `num_appended % memory_size`."""
         self._view_rows()
 
     def _view_rows(self) -> None:
@@ -69,7 +69,7 @@ class ReplayMemory:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._view_rows()  # a copy's own rows
+        self._view_rows()  # a copy has its own rows
 
     def __len__(self) -> int:
         return min(self.num_appended, len(self.rows))
@@ -84,14 +84,14 @@ class ReplayMemory:
         self.append_unchecked(Experience(*fields))
 
     def append_unchecked(self, experience: Experience) -> None:
-        """Does what `append` does, without checks: for training, which checks what the environment returns."""
+        """Does the same as `append`, without checks: training has checked the environment's values already."""
         i = self.num_appended % len(self.rows)
         scalars = self._scalars[i]
         self._states[i], scalars[0], scalars[1], self._next_states[i], scalars[2] = experience
         self.num_appended += 1
 
     def sample_rows(self, batch_size: int, rng: np.random.Generator) -> np.ndarray:
-        """Returns a uniformly random batch without repeats, as rows; one `rng.choice` draws it.
+        """Draws a uniformly random batch without repeats, with one `rng.choice`, and returns it as rows.
 
         Index 0 is the oldest transition in the memory, as in a deque.
 
@@ -102,19 +102,19 @@ class ReplayMemory:
         check_rng(rng)
         num_kept = len(self)
         if check_count("batch_size", batch_size) > num_kept:
-            raise ValueError(f"batch_size must be at most {num_kept}, as many as are in the memory, got {batch_size}")
+            raise ValueError(f"batch_size must be at most {num_kept}, the transitions in the memory, got {batch_size}")
         indices = rng.choice(num_kept, batch_size, replace=False)  # [B]
         if self.num_appended > len(self.rows):
             indices = (indices + self.num_appended) % len(self.rows)
         return self.rows.take(indices, axis=0)
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Experience:
-        """Returns a uniformly random batch without repeats, as arrays with a leading axis B."""
+        """Does the same as `sample_rows`, but returns the batch as arrays with a leading axis B."""
         return unpack(self.sample_rows(batch_size, rng), self.state_shape)
 
 
 def unpack(rows: Any, state_shape: tuple[int, ...]) -> Experience:
-    """Converts B rows of a ReplayMemory, a NumPy array or a tensor, to a batch."""
+    """Converts B rows of a ReplayMemory (a NumPy array or a tensor) to a batch."""
     size, shape = math.prod(state_shape), (-1, *state_shape)
     states, next_states, scalars = rows[:, :size], rows[:, size : 2 * size], rows[:, 2 * size :]
     if tf.is_tensor(rows):

@@ -1,4 +1,4 @@
-"""Seeds: everything random in a run depends on one number."""
+"""Seeds: one number determines everything random in a run."""
 
 import numpy as np
 
@@ -23,7 +23,7 @@ def acting_rng(seed: int) -> np.random.Generator:
 
 
 def episode_seed(seed: int, episode: int) -> int:
-    """Returns the seed of `env.reset` for one episode of a run, so that any episode can be started again exactly."""
+    """Returns the seed of `env.reset` for one episode of a run; it repeats the start of that episode exactly."""
     seed, episode = check_count("seed", seed, at_least=0), check_count("episode", episode, at_least=0)
     return int(_derived(seed, 2, episode).generate_state(1)[0])
 

@@ -34,11 +34,11 @@ class Summary(NamedTuple):
     share_solved: Estimate
     """Share of the seeds that are solved within `num_episodes`; Wilson interval."""
     median: Estimate
-    """Median of the episodes to solved; bootstrap interval. If most seeds are solved, the slowest do not change it."""
+    """Median of the episodes to solved; bootstrap interval. The slowest seeds do not change it, if most are solved."""
     interquartile_mean: Estimate
     """Mean of the middle half of the episodes to solved; bootstrap interval."""
     share_late: Estimate
-    """Share of the seeds that need more than `late_after` episodes, or are never solved; Wilson interval."""
+    """Share of the seeds that need more than `late_after` episodes or are never solved; Wilson interval."""
     median_env_steps: Estimate
     """Median of the environment steps to solved; bootstrap interval."""
     greedy_return: Estimate
@@ -46,7 +46,7 @@ class Summary(NamedTuple):
 
 
 def summarize(study: Study, late_after: int = 500) -> Summary:
-    """Returns the share of seeds solved, how long they take, and how well they play in the end.
+    """Returns the share of seeds solved, the episodes and steps that they need, and their greedy return.
 
     Args:
         study: a study with at least one seed.
@@ -67,7 +67,7 @@ def summarize(study: Study, late_after: int = 500) -> Summary:
 
 
 def sweep_table(sweep: Sweep, late_after: int = 500) -> str:
-    """Returns a Markdown table with a row for each setting of a sweep: the statistics of `summarize`."""
+    """Returns the statistics of `summarize` for each setting of a sweep, as a Markdown table."""
     check_instance("sweep", sweep, Sweep, "a Sweep")
     rows = ["| setting | seeds | solved | late or never | median episodes to solved | greedy return |"]
     rows.append("|---|---|---|---|---|---|")
@@ -96,7 +96,7 @@ class Comparison(NamedTuple):
 
 
 def compare(first: Study, second: Study) -> Comparison:
-    """Compares the episodes that two configurations need until they are solved; bootstrap intervals."""
+    """Compares the episodes to solved of two studies, with bootstrap intervals."""
     _check_study("first", first)
     _check_study("second", second)
     samples = first.episodes_to_solved, second.episodes_to_solved

@@ -1,4 +1,4 @@
-"""A study: the same run with many seeds, to see how reliable it is. One seed is an anecdote. A sweep: many settings."""
+"""`study`: the same run with many seeds, to see how reliable it is. `sweep`: a study of each of several settings."""
 
 import contextlib
 import dataclasses
@@ -32,7 +32,7 @@ class Study:
 
     config: Config
     outcomes: list[Outcome]
-    """One outcome per seed, in the order of the `seeds` asked for; interrupted seeds are missing."""
+    """One outcome per seed, in the order of the argument `seeds`; unfinished seeds are missing."""
 
     @property
     def seeds(self) -> np.ndarray:
@@ -51,17 +51,17 @@ class Study:
 
     @property
     def solved_at(self) -> np.ndarray:
-        """The number of the episode after which the stop rule held, [S] float64; NaN if it never did."""
+        """Number of the episode after which the stop rule held, [S] float64; NaN if it never did."""
         return np.array([np.nan if o.solved_at is None else o.solved_at for o in self.outcomes], np.float64)
 
     @property
     def episodes_to_solved(self) -> np.ndarray:
-        """The same as `solved_at`, [S] float64, but `config.num_episodes` if the stop rule never held."""
+        """The same as `solved_at`, but `config.num_episodes` if the stop rule never held, [S] float64."""
         return np.nan_to_num(self.solved_at, nan=self.config.num_episodes)
 
     @property
     def env_steps_to_solved(self) -> np.ndarray:
-        """Environment steps until the stop rule held, [S] float64; all that `config` allows if it never did."""
+        """Environment steps until the stop rule held, [S] float64; the maximum of `config` if it never did."""
         most = self.config.num_steps or self.config.num_episodes * self.config.max_steps
         return np.array([most if o.solved_at is None else o.steps.sum() for o in self.outcomes], np.float64)
 
@@ -72,7 +72,7 @@ class Study:
 
     @property
     def num_env_steps(self) -> int:
-        """The number of environment steps of all seeds together."""
+        """Number of environment steps of all seeds together."""
         return int(sum(outcome.steps.sum() for outcome in self.outcomes))
 
     def to_dict(self, each: Literal["seed", "episode"] = "seed") -> dict[str, np.ndarray]:
@@ -118,7 +118,7 @@ class Sweep(Mapping[str, Study]):
         return len(self._studies)
 
     def to_dict(self, each: Literal["seed", "episode"] = "seed") -> dict[str, np.ndarray]:
-        """Returns columns as `Study.to_dict` does, with a column `setting` before them."""
+        """Returns the columns of `Study.to_dict` for all settings, after a column `setting`."""
         parts = {name: study.to_dict(each) for name, study in self.items()}
         if not parts:
             return {}
@@ -145,7 +145,7 @@ def study(
     num_workers: int | None = None,
     verbose: int = 1,
 ) -> Study:
-    """Trains one agent for each seed, several at once; each run is exactly that of `train` with this seed.
+    """Trains one agent per seed, several in parallel; each run equals the run of `train` with that seed, bit for bit.
 
     Ctrl-C or SIGTERM ends the study and returns the finished seeds. Only a study with a `file` can be continued.
 
@@ -162,16 +162,16 @@ def study(
             of the run); None evaluates nothing.
         file: a file for the finished seeds. If you repeat the study, it trains only the missing seeds. Ctrl-C or a
             crash loses the unfinished ones.
-        engine: "joblib", processes on this machine; or "ray", tasks on the Ray cluster that this process is connected
-            to, or else on this machine (needs the extra `ray`). A Ray task is repeated if its worker dies.
+        engine: "joblib" uses processes on this machine. "ray" uses tasks on the Ray cluster that this process is
+            connected to, or else on this machine (needs the extra `ray`). A Ray task is repeated if its worker dies.
         num_workers: number of joblib's processes; by default one for each core. With 1, everything runs in this
             process. (Ray uses all cores of its cluster.) A worker's copy of the environment includes your own modules
             that it uses, in their present state.
         verbose: 1 shows a progress bar, 0 nothing.
 
     Raises:
-        TypeError, ValueError: as for `train`; or `file` is of another study (the message begins with what differs), or
-            another process is writing it.
+        TypeError, ValueError: as for `train`; or `file` is from another study (the message begins with the difference),
+            or another process is writing it.
         OSError: `file` cannot be written.
     """
     setting = Setting(env, config, q_network, optimizer, targets, loss, evaluate_on)
@@ -189,7 +189,7 @@ def sweep(
     num_workers: int | None = None,
     verbose: int = 1,
 ) -> Sweep:
-    """Makes a study of each of several settings, all of them at once: no worker waits for the end of a setting.
+    """Makes a study of each of several settings, in parallel: no worker waits for a setting to end.
 
     Args:
         env: an environment, as for `train`.
@@ -232,7 +232,7 @@ def _trained(
         with bar, contextlib.closing(trained), sigterm_interrupts():
             try:
                 for result in trained:
-                    if result is None:  # its run was asked to stop
+                    if result is None:  # a signal stopped its run
                         is_interrupted = True
                         break
                     task, outcomes[task] = result[0], result[1]
@@ -249,7 +249,7 @@ def _trained(
 
 
 def _padded(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Returns arrays of different lengths as the rows of one, filled up with NaN."""
+    """Returns arrays of different lengths as the rows of one array, padded with NaN."""
     padded = np.full((len(rows), max(map(len, rows), default=0)), np.nan)
     for row, values in zip(padded, rows, strict=True):
         row[: len(values)] = values
@@ -265,11 +265,11 @@ def load_study(path: str | os.PathLike) -> Study:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged, or something in it cannot be from a study; the message names the file.
+        ValueError: the file is damaged or was not written by `study`; the message names the file.
     """
     loaded = load_sweep(path)
     if list(loaded) != [""]:
-        raise ValueError(f"path {path} holds a sweep of {len(loaded)} settings: load_sweep loads it")
+        raise ValueError(f"path {path} holds a sweep of {len(loaded)} settings: load it with load_sweep")
     return loaded[""]
 
 
@@ -278,7 +278,7 @@ def load_sweep(path: str | os.PathLike) -> Sweep:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file is damaged, or something in it cannot be from a sweep; the message names the file.
+        ValueError: the file is damaged or was not written by `sweep`; the message names the file.
     """
     configs, outcomes = studies.read(check_path("path", path))
     found = {name: [outcome for task, outcome in outcomes.items() if task.name == name] for name in configs}

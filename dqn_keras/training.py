@@ -1,4 +1,4 @@
-"""train: a whole run, from new networks to the stop rule."""
+"""`train`: a whole run, from new networks to the stop rule."""
 
 import contextlib
 import dataclasses
@@ -37,17 +37,17 @@ from dqn_keras.storage.networks import save_q_network
 class Run:
     """The result of `train`.
 
-    It can be pickled, to bring it from another process, but then Keras drops the optimizer's state. To continue a run,
-    use `checkpoint`.
+    It can be pickled, for example to send it to another process, but Keras then drops the optimizer's state. Use
+    `checkpoint` to continue a run.
     """
 
     config: Config
     agent: Agent
     """Networks, optimizer, memory and random state after the last episode."""
     interrupted: bool = False
-    """Whether Ctrl-C or SIGTERM ended the run, at the end of an episode."""
+    """Whether Ctrl-C or SIGTERM stopped the run (at the end of an episode)."""
     diverged: bool = False
-    """Whether learning diverged, and a callback (keras.callbacks.TerminateOnNaN) ended the run without an error."""
+    """Whether learning diverged and a callback (keras.callbacks.TerminateOnNaN) stopped the run without an error."""
     steps_per_second: list[float] = dataclasses.field(default_factory=list)
     """Environment steps per second of each episode, learning included; NaN for episodes from before a resume."""
     first_action: int = 0
@@ -72,9 +72,9 @@ class Run:
 
     @property
     def history(self) -> dict[str, list[float]]:
-        """The logs of callbacks, one list for each name, like `history` in the result of Keras' `model.fit`.
+        """The logged values of all episodes, one list for each name, like `history` in the result of `model.fit`.
 
-        What a callback adds to the logs is there, too, with NaN for episodes in which it added nothing.
+        Values that a callback added to the logs are included, with NaN for episodes in which it added nothing.
         """
         num_episodes = len(self.episodes)
         added = {name: [*values, *[math.nan] * num_episodes][:num_episodes] for name, values in self.added_logs.items()}
@@ -82,7 +82,7 @@ class Run:
 
     @property
     def seed(self) -> int:
-        """The seed with which `train` repeats this run."""
+        """The seed of the run; with it, `train` repeats the run exactly."""
         return self.agent.seed
 
     @property
@@ -109,7 +109,7 @@ class Run:
         return self.first_action + int(q_values_now(self.q_network, checked).argmax())
 
     def save(self, path: str | os.PathLike) -> None:
-        """Saves only the network that acts, as a .keras file; `load_q_network`, or Keras anywhere, loads it."""
+        """Saves only the network that acts, as a .keras file, which `load_q_network` or Keras itself loads."""
         save_q_network(path, self.q_network)
 
     def __repr__(self) -> str:
@@ -135,7 +135,7 @@ def train(
     """Trains a Deep Q-Network until it solves `env` or has played all the episodes or steps that `config` allows.
 
     `train` uses your network, optimizer, targets, loss and environment themselves, not copies of them. It compiles them
-    again at each call, so that it sees your changes.
+    at each call, so it sees your changes.
 
     Args:
         env: a gymnasium.Env with a Box observation space and a Discrete action space; or a functional environment
@@ -156,26 +156,26 @@ def train(
         loss: any loss that Keras takes in `compile`: a name, a `keras.losses.Loss`, or a function of (y, q), both [B].
             The function returns a scalar, or [B], which is averaged. The default is the loss that you compiled
             `q_network` with, or else "mse".
-        callbacks: Keras callbacks, called as by `fit`; None for none. An episode is an epoch of one batch, with the
-            logs that `run.history` holds.
-            Callbacks see the network after each episode, may change it, and may set `model.stop_training`. Therefore
-            compiled episodes are played one at a time, unless all callbacks are plain keras.callbacks.CSVLogger.
+        callbacks: Keras callbacks, called as `fit` calls them; None for none. An episode is an epoch of one batch. Its
+            logs are the values in `run.history`. Callbacks see the network after each episode, may change it, and may
+            set `model.stop_training`. Therefore compiled episodes are played one at a time, unless all callbacks are
+            plain keras.callbacks.CSVLogger.
         checkpoint: a folder for the checkpoints of this run, each with its whole state; None saves none. If one cannot
-            be written during the run, a warning says so and the run continues. A resume does not notice every change
-            of the environment: not values that were set after it was made, and not constructor arguments that it keeps
-            under other names.
-        checkpoint_every: episodes from one checkpoint to the next; a few more if episodes are compiled. The start and
+            be written during the run, a warning says so and the run continues. A resumed run does not notice every
+            change of the environment: it misses values that were set after the environment was made, and constructor
+            arguments that the environment keeps under other names.
+        checkpoint_every: number of episodes between checkpoints, or a few more if episodes are compiled. The start and
             the end of the run are saved too.
-        resume: continue from the newest undamaged checkpoint in the folder, or start if there is none yet. The result
-            is bit for bit that of a run without interruption. Everything else must be the same, except that
-            num_episodes may be larger. Callbacks must save their own state. With a checkpoint, your own functions and
-            classes need a name that can be imported; they count as the same if they compute the same.
+        resume: continue from the newest undamaged checkpoint in the folder; start a new run if there is none yet. The
+            result equals, bit for bit, the result of a run without interruption. All other arguments must be the same,
+            except that num_episodes may be larger. Callbacks must save their own state. With a checkpoint, your own
+            functions and classes need a name that can be imported; they count as the same if they compute the same.
         verbose: 1 prints a line every 100 episodes and one when solved; 2 also shows a progress bar; 0 prints nothing.
 
     Raises:
-        TrainingInterrupted: Ctrl-C, an interrupted notebook cell or SIGTERM came. The episode is finished, and the run
-            is saved if there is a checkpoint folder; the exception's `run` has it. A second signal raises
-            KeyboardInterrupt at once.
+        TrainingInterrupted: after Ctrl-C, an interrupted notebook cell or SIGTERM. `train` first finishes the episode,
+            and saves the run if there is a checkpoint folder; the exception's `run` holds the run. A second signal
+            raises KeyboardInterrupt at once.
         TypeError, ValueError: an argument or a space is not supported; the network does not fit the environment; the
             environment returned a NaN, an infinity or a wrong shape (the message names episode and step); learning
             diverged.
@@ -200,8 +200,8 @@ def train(
         with Progress(run, verbose) as progress, stop_requests() as is_asked_to_stop, optimizer_shown(agent):
             listeners = Listeners(run, callbacks)
             listeners.begin()
-            heard = listeners.heard(played) if callbacks else played
-            _play_until_over(run, heard, progress, checkpoints, is_asked_to_stop)
+            reported = listeners.reported(played) if callbacks else played
+            _play_until_over(run, reported, progress, checkpoints, is_asked_to_stop)
             _finish(run, listeners, checkpoints)
     progress.show_end()
     if is_asked_to_stop():
@@ -211,7 +211,7 @@ def train(
 
 
 def _warn_of_an_early_end(run: Run) -> None:
-    """Warns if a limit ended the run before it could do what its other numbers ask for."""
+    """Warns if a limit ended the run before its first update, or before `num_steps` steps."""
     agent, config = run.agent, run.config
     num_steps = agent.memory.num_appended
     if not (agent.num_updates or run.diverged):
@@ -237,7 +237,7 @@ def prepare(
     targets: Callable,
     loss: str | Callable | None,
 ) -> tuple[Spaces, Formulas, Agent]:
-    """Checks the parts of a run, and returns the sizes of its spaces, its formulas and a new agent."""
+    """Checks the parts of a run; returns the environment's sizes, the formulas and a new agent."""
     spaces = check_environment(env, q_network)
     formulas = check_own_parts(config, q_network, optimizer, targets, loss)
     some = some_states(env.observation_space, spaces.state_dtype)
@@ -255,7 +255,7 @@ def _episodes(
     episodes_per_call: int,
     watch: Watch,
 ) -> Iterator[Episode]:
-    """Returns the episodes of the loop that can play `env`."""
+    """Returns the episodes, played by the loop for this kind of environment."""
     if not isinstance(env, FuncEnv):
         played = gymnasium.episodes(CheckedEnv(env, watch), run.agent, run.config, formulas)
         return watch.over(played, run.agent, run.config)
@@ -273,14 +273,14 @@ def _play_until_over(
     checkpoints: Checkpoints | None,
     is_asked_to_stop: Callable[[], bool],
 ) -> None:
-    """Plays until the stop rule, the last episode or a request to stop, and saves checkpoints."""
+    """Plays until the stop rule holds, the last episode ends or a stop is requested; saves checkpoints."""
     if run.solved_at is not None:  # a resumed run may be solved already
         return
     with contextlib.closing(played):
         for episode in played:
             progress.show(episode)
             if len(run.episodes) > episode.number + 1:
-                continue  # compiled episodes: the agent is ahead of this one
+                continue  # compiled episodes: the agent has played later ones already
             if checkpoints:
                 checkpoints.save_when_due(run.agent)
             if run.solved_at is not None:
@@ -293,8 +293,8 @@ def _play_until_over(
 def _finish(run: Run, listeners: Listeners, checkpoints: Checkpoints | None) -> None:
     """Ends a run as `fit` does: weight averages replace the weights, then the callbacks' `on_train_end` is called.
 
-    An interrupted run ends as `fit` does after an exception, without either. A checkpoint saves the weights themselves,
-    because a resumed run continues from them.
+    An interrupted run ends without either, as `fit` does after an exception. A checkpoint holds the weights, not the
+    averages, because a resumed run continues from the weights.
     """
     agent, keeper = run.agent, None if run.diverged else checkpoints
     averages = keeps_averages(agent.optimizer)
@@ -310,7 +310,7 @@ def _finish(run: Run, listeners: Listeners, checkpoints: Checkpoints | None) -> 
 
 
 def _timed(episodes: Iterator[Episode], run: Run) -> Generator[Episode, None, None]:
-    """Yields the episodes and notes their speed; all episodes of one compiled call get the speed of the call."""
+    """Yields the episodes and notes their speed; all episodes of one compiled call get the speed of that call."""
     while True:
         start = time.perf_counter()
         episode = next(episodes, None)
@@ -326,8 +326,8 @@ def _timed(episodes: Iterator[Episode], run: Run) -> Generator[Episode, None, No
 def _is_solved(episodes: Sequence[Episode], config: Config) -> bool:
     """Returns whether the stop rule holds after the last episode.
 
-    Compiled episodes stop early where it may hold (`_Loop.play`), so that a change of the rule belongs there, too.
-    The original also takes the mean of fewer episodes than the window, so that one lucky first episode could stop it.
+    If you change the rule, also change `_Loop.play`, where compiled episodes stop as soon as the rule may hold. The
+    original also takes the mean of fewer episodes than the window, so that one lucky first episode could stop it.
     """
     if config.solved_reward is None:
         return False

@@ -1,4 +1,4 @@
-"""Runs of many seeds and settings, several at once: in processes of this machine, or on a Ray cluster."""
+"""Workers: train many seeds and settings in parallel, in processes on this machine or on a Ray cluster."""
 
 import contextlib
 import functools
@@ -37,14 +37,14 @@ from dqn_keras.training import train
 
 
 class Setting(NamedTuple):
-    """What all seeds of a study are trained with."""
+    """The arguments that all seeds of a study share."""
 
     env: gym.Env | FuncEnv
     config: Config = Config()
     q_network: Callable[[int], keras.Model] | None = None
-    """Makes a new network for a seed."""
+    """Returns a new network for a seed."""
     optimizer: Callable[[], keras.Optimizer] | None = None
-    """Makes a new optimizer."""
+    """Returns a new optimizer."""
     targets: Callable = td_targets
     loss: str | Callable | None = None
     evaluate_on: gym.Env | FuncEnv | None = None
@@ -70,24 +70,24 @@ Results = Generator[tuple[Task, Outcome] | None, None, None]
 
 
 def results(settings: Mapping[str, Setting], tasks: Sequence[Task], engine: str, num_workers: int) -> Results:
-    """Trains the tasks and yields each with its outcome as soon as it is there; None for a run that was interrupted."""
+    """Trains the tasks and yields each with its outcome as soon as it ends; yields None for an interrupted run."""
     names = {task.name for task in tasks}
     pickled = {name: _pickled(setting) for name, setting in settings.items() if name in names}
     yield from ENGINES[engine](pickled, tasks, num_workers)
 
 
 class _Pickled(NamedTuple):
-    """A setting in the form in which a worker gets it."""
+    """A setting, pickled for a worker."""
 
     content: bytes
     computes: str
     """Digest of what a functional environment computes in this process."""
     key: str
-    """Differs from that of every other setting, also in another study."""
+    """Unique to this setting of this study."""
 
 
 def _pickled(setting: Setting) -> _Pickled:
-    """Pickles a setting; of an environment that cannot be pickled, for example after rendering, only the spec."""
+    """Pickles a setting. If that fails, as it may after rendering, pickles the specs of its environments instead."""
     computes = describe(setting.env)[0].computes
     try:
         content = _pickled_with_its_modules(setting)
@@ -101,14 +101,14 @@ def _pickled(setting: Setting) -> _Pickled:
 
 
 def _pickled_with_its_modules(thing: Any) -> bytes:
-    """Pickles something with the user's modules as they are now; a worker would import those on the disk."""
+    """Pickles something with the user's modules as they are in memory; a worker would import them from the disk."""
     modules = [x for x in sys.modules.copy().values() if isinstance(x, ModuleType) and not is_of_a_library(x)]
     modules = [x for x in modules if sys.modules.get(x.__name__) is x and x.__name__ != "__main__"]
     for module in modules:
         cloudpickle.register_pickle_by_value(module)
     try:
         return cloudpickle.dumps(thing)
-    except Exception:  # something in them cannot be pickled, such as a lock
+    except Exception:  # a module holds something that cannot be pickled, such as a lock
         pass
     finally:
         for module in modules:
@@ -118,19 +118,19 @@ def _pickled_with_its_modules(thing: Any) -> bytes:
 
 @functools.lru_cache(maxsize=100)
 def _unpickled(pickled: _Pickled) -> tuple[Setting, dict]:
-    """Returns this process's own setting and the programs compiled for it, both made once in a study."""
+    """Unpickles a setting once in this process; also returns a dictionary for the programs compiled for it."""
     setting: Setting = cloudpickle.loads(pickled.content)
     setting = setting._replace(env=_made(setting.env), evaluate_on=_made(setting.evaluate_on))
     if describe(setting.env)[0].computes != pickled.computes:
         raise ValueError(
-            f"num_workers must be 1 for env {type(setting.env).__name__}, which computes something else in another "
-            "process: a module that was changed after its import is imported there as it is on the disk"
+            f"num_workers must be 1 for env {type(setting.env).__name__}, which computes something else in a worker: a "
+            "worker imports modules from the disk, without changes that were made after their import"
         )
     return setting, {}
 
 
 def _made(env: Any) -> Any:
-    """Returns the environment of a spec; an environment as it is."""
+    """Makes the environment of a spec; returns an environment unchanged."""
     return gym.make(env) if isinstance(env, gym.envs.registration.EnvSpec) else env
 
 
@@ -156,11 +156,11 @@ def _train_seed(pickled: _Pickled, seed: int) -> Outcome | None:
 
 
 def _train_seed_in_worker(pickled: _Pickled, task: Task) -> tuple[Task, Outcome] | None:
-    """Trains one seed in a worker process. TensorFlow gets one thread there, because each core has a process."""
-    with contextlib.suppress(RuntimeError):  # TensorFlow has started already, in a worker with an earlier task
+    """Trains one seed in a worker, where TensorFlow gets only one thread, because each core has a worker."""
+    with contextlib.suppress(RuntimeError):  # TensorFlow has started already: the worker has had a task before
         tf.config.threading.set_intra_op_parallelism_threads(1)
     outcome = _train_seed(pickled, task.seed)
-    publish()  # now, since a worker may be killed when the study ends
+    publish()  # now, because a worker may be killed when the study ends
     return None if outcome is None else (task, outcome)
 
 
@@ -170,8 +170,8 @@ def _by_joblib(settings: Mapping[str, _Pickled], tasks: Sequence[Task], num_work
             outcome = _train_seed(settings[task.name], task.seed)
             yield None if outcome is None else (task, outcome)
         return
-    # loky replaces a worker whose memory has grown, for example when an optimizer is compiled for each seed. The next
-    # one continues, and no seed is lost.
+    # loky replaces a worker whose memory has grown, for example when an optimizer is compiled for each seed. The new
+    # worker continues, and no seed is lost.
     warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor", UserWarning)
     backend = parallel_config(backend="loky", inner_max_num_threads=1)
     with backend, _compilation_cache_in_children(), _interrupts_ignored_by_children():
@@ -188,7 +188,7 @@ def _by_joblib(settings: Mapping[str, _Pickled], tasks: Sequence[Task], num_work
 
 @contextlib.contextmanager
 def _compilation_cache_in_children() -> Iterator[None]:
-    """Lets the processes that start within the block use the cache of compiled programs, unless the user chose."""
+    """Makes processes that start in the block use the cache of compiled programs, unless the user has set it."""
     is_chosen = "DQN_KERAS_CACHE" in os.environ
     os.environ.setdefault("DQN_KERAS_CACHE", "1")
     try:
@@ -200,7 +200,7 @@ def _compilation_cache_in_children() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _interrupts_ignored_by_children() -> Iterator[None]:
-    """Makes processes that start inside it ignore Ctrl-C, which a terminal sends to all; this process handles it."""
+    """Makes processes that start in the block ignore Ctrl-C, which a terminal sends to all; this process handles it."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

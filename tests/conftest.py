@@ -22,7 +22,7 @@ def cartpole():
 
 @pytest.fixture
 def script_folder(tmp_path, monkeypatch):
-    """For the scripts of the README and the docs: an empty folder, no window, and studies in this process."""
+    """Prepares for scripts of the README and the docs: an empty folder, no window, and studies in this process."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.setattr(importlib.import_module("dqn_keras.study"), "cpu_count", lambda: 1)
@@ -36,7 +36,7 @@ def rng():
 
 @pytest.fixture
 def random_batch(rng):
-    """A function: (batch size, features, actions) -> five arrays as `learn` takes them."""
+    """Returns a function: (batch size, features, actions) -> five arrays for `learn`."""
 
     def make(batch_size=64, num_features=4, num_actions=2):
         return (
@@ -61,7 +61,7 @@ print(fingerprint(train({env}, QUICK, seed={seed}, verbose=0)))
 
 @pytest.fixture
 def in_another_process():
-    """A function: (expression that makes an env, seed) -> fingerprint of a quick run in a fresh process."""
+    """Returns a function: (expression that makes an env, seed) -> fingerprint of a quick run in a fresh process."""
 
     def run(env, seed):
         return subprocess.run(

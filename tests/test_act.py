@@ -45,7 +45,7 @@ def convolutional():
     [lambda: None, lambda: dense("relu"), lambda: dense("tanh"), functional],
     ids=["the default network", "ReLU", "tanh", "a dictionary of inputs"],
 )
-def test_an_episode_played_by_it_is_that_of_evaluate(cartpole, network):
+def test_acting_greedily_plays_the_episode_of_evaluate(cartpole, network):
     run = train(cartpole, QUICK, seed=0, q_network=network(), verbose=0)
     total, is_over, (state, _) = 0.0, False, cartpole.reset(seed=evaluation_seed(3, 0))
     while not is_over:
@@ -62,7 +62,7 @@ def prefer(action, q_network):
 
 
 @pytest.mark.parametrize("network", [lambda: None, lambda: dense("tanh")])
-def test_it_uses_the_weights_that_the_network_has_now(cartpole, network):
+def test_act_uses_the_weights_that_the_network_has_now(cartpole, network):
     run = train(cartpole, QUICK, seed=0, q_network=network(), verbose=0)
     for action in (0, 1, 0):
         prefer(action, run.q_network)
@@ -99,7 +99,7 @@ def test_a_run_that_was_pickled_acts(cartpole):
         assert [pickle.loads(pickle.dumps(run)).act(state) for state in states] == actions
 
 
-def test_a_state_that_is_none_is_named(cartpole):
+def test_what_is_not_a_state_is_an_error_that_names_it(cartpole):
     run = train(cartpole, QUICK, seed=0, verbose=0)
     assert run.act([0, 0, 0, 0]) == run.act(tf.zeros(4)) == run.act(np.zeros(4))
     for error, state, message in [

@@ -12,7 +12,7 @@ from tests.helpers import parts
 from tests.helpers.parts import NETWORKS, dense, sequential
 from tests.helpers.short_runs import BOTH_LOOPS, QUICK, Settings, fresh, learned, sgd, trained, weights_of
 
-# What is not in a configuration is kept
+# Values outside a configuration are kept
 
 
 def test_normalization_scales_in_acting_learning_and_q_hat():
@@ -50,7 +50,7 @@ def test_own_schedules_and_lambda_layers_train(make_env):
 
 
 @pytest.mark.slow
-def test_a_learning_rate_that_is_a_python_function_is_called_once_and_that_is_said():
+def test_a_learning_rate_that_is_a_python_function_is_called_once_with_a_warning():
     with pytest.warns(UserWarning, match=r"the learning rate of 'sgd.*' is a Python function, .* it stays at 0.03"):
         trained(optimizer=keras.optimizers.SGD(lambda: 0.03))
 
@@ -65,7 +65,7 @@ def test_learn_calls_a_learning_rate_that_is_a_python_function_at_each_step(rand
 
 
 class Forgetful(keras.layers.Layer):
-    """Its factor is in no configuration, and is no plain attribute."""
+    """Multiplies by a factor that is neither in its configuration nor a plain attribute."""
 
     def __init__(self, held=None, **kwargs):
         super().__init__(**kwargs)
@@ -78,7 +78,7 @@ class Forgetful(keras.layers.Layer):
         return {"name": self.name}
 
 
-def test_a_layer_that_a_copy_does_not_equal_is_refused_by_name():
+def test_a_layer_whose_copy_differs_is_an_error_that_names_it():
     held = Settings()
     held.factor = 7.0
     network = sequential(dense(8), Forgetful(held, name="forgetful"))
@@ -88,7 +88,7 @@ def test_a_layer_that_a_copy_does_not_equal_is_refused_by_name():
         train(CartPole(), QUICK, q_network=network, verbose=0)
 
 
-def test_a_layer_that_cannot_be_made_again_is_refused_by_name():
+def test_a_layer_that_cannot_be_copied_is_an_error_that_names_it():
     class Demanding(keras.layers.Layer):
         def __init__(self, factor):
             super().__init__(name="demanding")
@@ -125,9 +125,9 @@ def test_regularization_is_part_of_the_loss(make_env):
 
 def test_one_warning_names_the_layers_that_differ_in_training(cartpole):
     network = sequential(dense(8, "relu"), keras.layers.Dropout(0.5, name="drop"))
-    with pytest.warns(UserWarning, match=r"q_network is called in inference mode.*: drop \(Dropout\)") as told:
+    with pytest.warns(UserWarning, match=r"q_network is called in inference mode.*: drop \(Dropout\)") as caught:
         train(cartpole, QUICK, seed=0, q_network=network, verbose=0)
-    assert len([w for w in told if "inference mode" in str(w.message)]) == 1
+    assert len([w for w in caught if "inference mode" in str(w.message)]) == 1
 
 
 @pytest.mark.slow
@@ -142,7 +142,7 @@ def test_after_a_run_with_ema_the_network_holds_the_averages_as_after_fit(make_e
     assert not np.array_equal(weights_of(plain.q_network), weights_of(run.q_network))
 
 
-# Optimizer, loss and targets: whose, and which
+# Which optimizer, loss and targets are used
 
 
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_a_network_that_train_compiled_itself_starts_the_next_run_with_a_new_ada
     np.testing.assert_array_equal(first, second)
 
 
-def test_alpha_and_an_optimizer_that_say_different_things_are_refused(cartpole):
+def test_alpha_and_an_optimizer_with_another_learning_rate_are_refused(cartpole):
     config = Config(alpha=0.01)
     with pytest.raises(ValueError, match=r"^alpha must be left at its default of 0.001 with an optimizer .*, got 0.01"):
         train(cartpole, config, optimizer=sgd())
@@ -225,7 +225,7 @@ WRONG = {
     "a loss without q": (
         {"loss": lambda y, q: tf.reduce_mean(y)},
         ValueError,
-        r"^loss must depend on q by operations that TensorFlow can differentiate",
+        r"^loss must depend on q through operations that TensorFlow can differentiate",
     ),
     "targets for every action": (
         {"targets": lambda batch, gamma, q, q_hat: q_hat(batch.next_state)},
@@ -236,7 +236,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_a_slot_filled_wrongly_is_named_in_both_doors(case, cartpole, random_batch):
+def test_a_wrong_part_is_an_error_that_names_it_in_train_and_in_learn(case, cartpole, random_batch):
     own, error, message = WRONG[case]
     with pytest.raises(error, match=message):
         train(cartpole, QUICK, seed=0, verbose=0, **own)
@@ -248,7 +248,7 @@ def test_a_slot_filled_wrongly_is_named_in_both_doors(case, cartpole, random_bat
 def test_an_optimizer_of_another_run_is_refused(cartpole):
     optimizer = sgd()
     train(cartpole, QUICK, seed=0, optimizer=optimizer, verbose=0)
-    with pytest.raises(ValueError, match=r"^optimizer must be a new one, or one that was built for this q_network"):
+    with pytest.raises(ValueError, match=r"^optimizer must be new or built for this q_network, got"):
         train(cartpole, QUICK, seed=0, optimizer=optimizer, verbose=0)
 
 
@@ -257,7 +257,7 @@ def test_an_optimizer_of_another_run_is_refused(cartpole):
 
 @pytest.mark.slow
 @BOTH_LOOPS
-def test_double_targets_are_targets_of_ones_own_that_do_the_same(make_env):
+def test_double_targets_equal_own_targets_that_do_the_same(make_env):
     def by_hand(experiences, gamma, q_network, q_hat_network):
         best = tf.one_hot(tf.argmax(q_network(experiences.next_state), axis=1), 2)
         values = tf.reduce_sum(best * q_hat_network(experiences.next_state), axis=1)
@@ -271,7 +271,7 @@ def test_double_targets_are_targets_of_ones_own_that_do_the_same(make_env):
 
 def test_no_gradient_flows_through_the_targets(random_batch):
     def through_q(experiences, gamma, q_network, q_hat_network):
-        return td_targets(experiences, gamma, q_hat_network, q_network)  # Q in the place of Q-hat
+        return td_targets(experiences, gamma, q_hat_network, q_network)  # Q takes the place of Q-hat
 
     def cut(*arguments):
         return tf.stop_gradient(through_q(*arguments))
@@ -329,7 +329,7 @@ def test_a_network_of_another_form_is_refused_in_one_line(case, random_batch, ca
         train(cartpole, q_network=make())
 
 
-def test_what_xla_cannot_compile_is_named_with_the_way_out(random_batch):
+def test_what_xla_cannot_compile_is_an_error_that_says_what_to_do(random_batch):
     def printing(y, q):
         tf.raw_ops.PrintV2(input=tf.strings.as_string(y[0]))
         return tf.reduce_mean(tf.square(y - q))
@@ -338,7 +338,7 @@ def test_what_xla_cannot_compile_is_named_with_the_way_out(random_batch):
         learn(random_batch(), 0.9, *fresh(), sgd(), loss=printing)
 
 
-# What a review found
+# Calls of the user's, EMA, copies and compiled networks
 
 
 class Clipped(keras.Sequential):
@@ -404,7 +404,7 @@ def test_a_function_of_the_users_can_still_be_differentiated_after_a_run():
 
 @pytest.mark.slow
 @BOTH_LOOPS
-def test_averages_are_the_networks_before_callbacks_hear_of_the_end(make_env, tmp_path):
+def test_averages_replace_the_weights_before_on_train_end_is_called(make_env, tmp_path):
     optimizer, seen, best = keras.optimizers.SGD(0.1, use_ema=True, ema_momentum=0.99), [], []
 
     class Restoring(keras.callbacks.Callback):
@@ -431,7 +431,7 @@ def test_a_run_with_averages_and_callbacks_is_resumed_bit_for_bit(tmp_path):
     whole = run(9)
     run(5, checkpoint=tmp_path)
     np.testing.assert_array_equal(whole, run(9, checkpoint=tmp_path, resume=True))
-    np.testing.assert_array_equal(whole, run(9, checkpoint=tmp_path, resume=True))  # which has nothing left to do
+    np.testing.assert_array_equal(whole, run(9, checkpoint=tmp_path, resume=True))  # a finished run
 
 
 @pytest.mark.slow
@@ -451,7 +451,7 @@ AXIS_LOSSES = ["mse", "mae", "huber", "kl_divergence", "cosine_similarity", "cat
 
 
 @pytest.mark.parametrize("loss", AXIS_LOSSES)
-def test_the_name_of_a_loss_means_what_it_means_to_compile(loss, random_batch):
+def test_the_name_of_a_loss_means_the_same_as_in_compile(loss, random_batch):
     batch = [np.abs(x) for x in random_batch(8)]
     q_network, q_hat_network = fresh()
     value = float(learn(batch, 0.0, q_network, q_hat_network, keras.optimizers.SGD(0.0), loss=loss))
@@ -462,7 +462,7 @@ def test_the_name_of_a_loss_means_what_it_means_to_compile(loss, random_batch):
 
 
 class Scaling(keras.layers.Layer):
-    """Keeps a function over its own weight."""
+    """Keeps a function that uses its own weight."""
 
     def build(self, shape):
         self.scale = self.add_weight(shape=(), initializer="ones")
@@ -472,7 +472,7 @@ class Scaling(keras.layers.Layer):
         return self.function(inputs)
 
 
-def test_a_function_that_a_layer_makes_for_itself_is_the_copys_own(cartpole):
+def test_a_function_that_a_layer_makes_for_itself_is_made_again_in_the_copy(cartpole):
     run = train(cartpole, QUICK, 0, q_network=sequential(dense(8), Scaling()), verbose=0)
     layer = run.q_hat_network.layers[1]
     layer.scale.assign(0.0)

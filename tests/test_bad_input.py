@@ -1,4 +1,4 @@
-"""What the original takes without a word, or with one that names nothing: here each is an error that names it."""
+"""Bad input that the original accepts silently, or with an unclear error, is an error that names it."""
 
 import gymnasium as gym
 import keras
@@ -71,13 +71,13 @@ CONFIGS = [
 
 
 @pytest.mark.parametrize("fields", CONFIGS, ids=repr)
-def test_a_bad_parameter_is_told_by_name(fields):
+def test_a_bad_parameter_is_an_error_that_names_it(fields):
     with pytest.raises((TypeError, ValueError)) as caught:
         Config(**fields)
     (name,) = fields
-    told = str(caught.value)
-    assert told.split()[0].split("[")[0] in (name, "batch_size")
-    assert name in told
+    message_got = str(caught.value)
+    assert message_got.split()[0].split("[")[0] in (name, "batch_size")
+    assert name in message_got
 
 
 def play(**parts):
@@ -145,6 +145,6 @@ OTHERS = {
 
 
 @pytest.mark.parametrize(("call", "message"), OTHERS.values(), ids=OTHERS.keys())
-def test_a_bad_input_is_told(call, message):
+def test_a_bad_input_is_an_error_that_names_it(call, message):
     with pytest.raises((TypeError, ValueError), match=f"^{message}"):
         call()

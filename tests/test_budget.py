@@ -1,4 +1,4 @@
-"""A run that a number of environment steps limits, and one without a stop rule."""
+"""Runs with a limit of environment steps, and runs without a stop rule."""
 
 import warnings
 
@@ -51,7 +51,7 @@ def test_a_time_limit_at_the_last_step_is_no_cut():
         assert train(corridor, config, seed=0, verbose=0).rewards.tolist() == [4.0, 4.0, 4.0]
 
 
-def test_callbacks_hear_of_every_episode_and_change_nothing(env):
+def test_callbacks_see_every_episode_and_change_nothing(env):
     tape = Tape()
     run = train(env, PUBLISHED, seed=0, verbose=0, callbacks=[tape])
     numbers = [call[1] for call in tape.calls if call[0] == "ends"]
@@ -70,14 +70,14 @@ def test_a_resume_is_exact_and_a_finished_run_stays_as_it_is(env, tmp_path):
         assert run.agent.num_updates == whole.agent.num_updates
 
 
-def test_without_a_stop_rule_the_run_goes_on(env):
+def test_without_a_stop_rule_the_run_continues(env):
     easy = {"num_episodes": 8, "solved_window": 2, "batch_size": 8}
     assert train(env, Config(**easy, solved_reward=1), seed=0, verbose=0).solved_at == 1
     run = train(env, Config(**easy, solved_reward=None), seed=0, verbose=0)
     assert (len(run.episodes), run.solved_at) == (8, None)
 
 
-def test_a_limit_of_episodes_before_that_of_steps_is_told(env):
+def test_a_limit_of_episodes_before_the_limit_of_steps_is_a_warning(env):
     with pytest.warns(UserWarning, match="num_episodes=5 episodes and .* of num_steps=5000"):
         train(env, Config(num_episodes=5, num_steps=5_000, batch_size=8), seed=0, verbose=0)
     with warnings.catch_warnings(action="error"):

@@ -33,13 +33,13 @@ def weights(run):
 
 
 @pytest.mark.slow
-def test_the_history_is_what_keras_history_heard(env):
-    heard = keras.callbacks.History()
-    run = play(env, heard)
+def test_the_history_equals_keras_history(env):
+    keras_history = keras.callbacks.History()
+    run = play(env, keras_history)
     assert list(run.history) == NAMES
-    assert heard.epoch == list(range(40))
+    assert keras_history.epoch == list(range(40))
     for name in NAMES:
-        np.testing.assert_array_equal(run.history[name], heard.history[name])
+        np.testing.assert_array_equal(run.history[name], keras_history.history[name])
 
 
 @pytest.mark.slow
@@ -50,7 +50,7 @@ def test_csv_logger_writes_the_history_and_changes_nothing(env, tmp_path):
     assert rows[0].keys() == {"epoch", *NAMES}
     for name in NAMES:
         np.testing.assert_array_equal([float(row[name]) for row in rows], run.history[name])
-    np.testing.assert_array_equal(weights(run), weights(play(env)))  # none at all
+    np.testing.assert_array_equal(weights(run), weights(play(env)))  # no callbacks
     np.testing.assert_array_equal(weights(run), weights(play(env, keras.callbacks.Callback())))  # one call an episode
 
 
@@ -87,7 +87,7 @@ def test_model_checkpoint_keeps_the_network_of_the_best_moving_average(env, tmp_
     assert evaluate(gym.make("CartPole-v1"), kept, 1, seed=0).shape == (1,)
 
 
-def test_early_stopping_ends_the_run_where_it_should_and_gives_back_the_best_weights(env):
+def test_early_stopping_ends_the_run_where_it_should_and_restores_the_best_weights(env):
     rewards = play(env).rewards
     patience, best, waited = 5, -np.inf, 0
     for stop, reward in enumerate(rewards):  # noqa: B007
@@ -108,7 +108,7 @@ def test_terminate_on_nan_ends_a_run_that_diverges(env, tmp_path):
     terminate = keras.callbacks.TerminateOnNaN()
     run = play(env, SpoiledVelocity(), terminate, checkpoint=tmp_path / "run", checkpoint_every=5)
     assert (run.diverged, len(run.rewards)) == (True, 12)
-    sound = play(env, checkpoint=tmp_path / "run", resume=True)  # from episode 10: what was kept is whole
+    sound = play(env, checkpoint=tmp_path / "run", resume=True)  # from episode 10, a whole checkpoint
     np.testing.assert_array_equal(weights(sound), weights(play(env)))
     assert not sound.diverged
     with pytest.raises(ValueError, match="not finite in episode 12"):
@@ -123,7 +123,7 @@ def test_terminate_on_nan_does_not_mind_the_episodes_before_the_first_update(env
 
 
 class Recorder(keras.callbacks.Callback):
-    """Records each call: its name, its number if it has one, and whether the logs hold a loss."""
+    """Records each call: its name, its number if there is one, and whether the logs hold a loss."""
 
     def __init__(self, do=lambda event, model: None):
         super().__init__()
@@ -171,7 +171,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize("do", ENDS.values(), ids=ENDS.keys())
-def test_callbacks_are_called_as_by_fit(env, do):
+def test_callbacks_are_called_as_fit_calls_them(env, do):
     recorders = Recorder(do), Recorder(do)
     model = keras.Sequential([keras.Input((1,)), keras.layers.Dense(1)])
     model.compile(loss="mse")
@@ -182,7 +182,7 @@ def test_callbacks_are_called_as_by_fit(env, do):
     assert recorders[1].calls == recorders[0].calls
 
 
-def test_callbacks_are_called_as_by_fit_when_a_step_fails(env):
+def test_callbacks_are_called_as_fit_calls_them_when_a_step_fails(env):
     def break_network(model):
         model.layers[0].kernel.assign(np.full(model.layers[0].kernel.shape, np.nan))
 
@@ -221,7 +221,7 @@ def test_no_callbacks_may_be_none(env):
 
 
 class Meddler(keras.callbacks.Callback):
-    """A reader's own callback: at one episode it takes all that was learned away."""
+    """Deletes at one episode all that was learned, as a user's own callback may."""
 
     def on_epoch_begin(self, epoch, logs=None):
         if epoch == 20:
@@ -235,10 +235,10 @@ def test_a_callback_may_change_the_network(env):
 
 
 @pytest.mark.slow
-def test_one_callback_needs_no_list_and_what_is_none_is_refused(env):
-    heard = keras.callbacks.History()
-    train(env, Config(num_episodes=2, batch_size=2), seed=0, callbacks=heard, verbose=0)
-    assert heard.epoch == [0, 1]
+def test_one_callback_needs_no_list_and_another_object_is_refused(env):
+    keras_history = keras.callbacks.History()
+    train(env, Config(num_episodes=2, batch_size=2), seed=0, callbacks=keras_history, verbose=0)
+    assert keras_history.epoch == [0, 1]
     with pytest.raises(TypeError, match=r"^callbacks must be Keras callbacks, got 'log\.csv'"):
         train(env, callbacks=["log.csv"])
 
@@ -250,29 +250,29 @@ def test_the_bar_stands_beside_the_originals_lines(env, capfd):
     lines = capfd.readouterr().out
     play(env, config=config, verbose=2)
     out, bar = capfd.readouterr()
-    assert out.split() == lines.split()  # tqdm writes them between its own
+    assert out.split() == lines.split()  # tqdm writes them between its own lines
     assert "110/110" in bar
     play(env, keras.callbacks.Callback(), config=config, verbose=0)
     assert capfd.readouterr() == ("", "")
 
 
-def test_the_numbers_of_a_resumed_run_are_those_of_the_whole_run(env, tmp_path):
+def test_a_resumed_run_logs_the_same_numbers_as_the_whole_run(env, tmp_path):
     whole = play(env)
     play(env, config=Config(**{**vars(CONFIG), "num_episodes": 15}), checkpoint=tmp_path)
-    heard = keras.callbacks.History()
-    run = play(env, heard, checkpoint=tmp_path, resume=True)
-    assert heard.epoch == list(range(15, 40))
+    keras_history = keras.callbacks.History()
+    run = play(env, keras_history, checkpoint=tmp_path, resume=True)
+    assert keras_history.epoch == list(range(15, 40))
     for name in NAMES[:-1]:
         np.testing.assert_array_equal(run.history[name], whole.history[name])
-        np.testing.assert_array_equal(heard.history[name], whole.history[name][15:])
+        np.testing.assert_array_equal(keras_history.history[name], whole.history[name][15:])
     assert np.isnan(run.history["steps_per_second"][:15]).all()
     assert (np.array(run.history["steps_per_second"][15:]) > 0).all()
 
 
 @pytest.mark.slow
-def test_a_csv_loggers_rows_are_those_that_keras_writes(env, tmp_path):
+def test_a_csv_logger_writes_the_same_rows_as_in_keras(env, tmp_path):
     class KerasOwn(keras.callbacks.CSVLogger):
-        """Not exactly a CSVLogger, so that its own `on_epoch_end` is called."""
+        """A subclass of CSVLogger, so that its own `on_epoch_end` is called."""
 
     for kind, options in [("fast", {}), ("append", {"append": True, "separator": ";"})]:
         fast, slow = tmp_path / f"{kind}.csv", tmp_path / f"{kind}_keras.csv"

@@ -1,4 +1,4 @@
-"""`learn` sees a change of its parts between two calls, wherever it is, and compiles for nothing else."""
+"""`learn` sees any change of its parts between two calls, and compiles again only for such changes."""
 
 import argparse
 import functools
@@ -16,7 +16,7 @@ from dqn_keras import learn, make_networks, td_targets
 
 
 class Learning:
-    """Two networks and an optimizer that learn from one batch, from the same weights at each call."""
+    """Learns from one batch, with the same weights at the start of each call."""
 
     def __init__(self, batch, jit_compile=False):
         self.networks, self.optimizer = make_networks(4, 2, (8,), seed=0), keras.optimizers.SGD(0.1)
@@ -90,7 +90,7 @@ SOURCES = {
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):
-    """A package of the user's without an __init__.py, whose settings.K is 1."""
+    """Makes a user's package without an __init__.py, whose settings.K is 1."""
     (tmp_path / "pkg").mkdir()
     (tmp_path / "pkg" / "settings.py").write_text("K = 1.0\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -122,7 +122,7 @@ def test_a_change_in_a_module_without_a_file_or_a_place(learning, package, tmp_p
 
 
 @pytest.mark.parametrize("wrapped", [td_targets, keras.losses.huber])
-def test_a_change_in_a_function_that_bears_the_name_of_a_librarys(wrapped, learning):
+def test_a_change_in_a_function_with_the_name_of_a_library_function(wrapped, learning):
     held = {"factor": 1.0}
 
     @functools.wraps(wrapped)
@@ -143,7 +143,7 @@ def test_a_change_in_what_a_decorated_function_reads(learning):
 
 
 class Trainer:
-    """A usual class of a script: its loss is a method, and it keeps what `learn` returns."""
+    """A typical class of a script: its loss is a method, and it keeps what `learn` returns."""
 
     def __init__(self, factor):
         self.factor, self.losses, self.num_calls = factor, [], 0
@@ -219,7 +219,7 @@ WRONG_SHAPES = {
 
 
 @pytest.mark.parametrize("case", WRONG_SHAPES)
-def test_what_does_not_have_the_batchs_size_is_refused(case, learning):
+def test_a_formula_that_returns_another_size_than_the_batch_is_refused(case, learning):
     own, message = WRONG_SHAPES[case]
     with pytest.raises(ValueError, match=message):
         learning(**own)

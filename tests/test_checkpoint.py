@@ -28,7 +28,7 @@ QUICK = dataclasses.replace(CONFIG, num_episodes=40)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("loop", LOOPS)
-def test_a_run_resumed_three_times_ends_with_the_bits_of_one_that_was_not(loop, tmp_path):
+def test_a_run_resumed_three_times_ends_with_the_bits_of_an_uninterrupted_one(loop, tmp_path):
     whole = train(LOOPS[loop](), QUICK, SEED, verbose=0)
     for num_episodes in (7, 8, 33, 40):
         config = dataclasses.replace(QUICK, num_episodes=num_episodes)
@@ -40,7 +40,7 @@ def test_a_run_resumed_three_times_ends_with_the_bits_of_one_that_was_not(loop, 
 
 
 @pytest.mark.slow
-def test_killed_runs_end_with_the_bits_of_one_that_was_not(tmp_path):
+def test_killed_runs_end_with_the_bits_of_an_uninterrupted_one(tmp_path):
     figures = faults.kill_campaign(tmp_path, num_kills=8, num_in_saves=4, kills_per_run=4)
     assert figures["kills"] == 8
     assert figures["of them inside a save"] >= 4
@@ -48,7 +48,7 @@ def test_killed_runs_end_with_the_bits_of_one_that_was_not(tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_runs_with_own_parts_end_with_the_bits_of_one_that_was_not(tmp_path):
+def test_killed_runs_with_own_parts_end_with_the_bits_of_an_uninterrupted_one(tmp_path):
     cases = (("Gymnasium loop", "LSTM, own targets"), ("compiled episodes", "convolution, own loss"))
     figures = faults.kill_campaign(tmp_path, num_kills=4, num_in_saves=2, kills_per_run=2, cases=cases)
     assert figures["kills"] == 4
@@ -56,7 +56,7 @@ def test_killed_runs_with_own_parts_end_with_the_bits_of_one_that_was_not(tmp_pa
 
 
 @pytest.mark.slow
-def test_runs_that_are_asked_to_stop_stop_and_go_on_to_the_same_bits(tmp_path):
+def test_runs_that_are_asked_to_stop_stop_and_continue_to_the_same_bits(tmp_path):
     figures = faults.signal_campaign(tmp_path, 4)
     assert figures["runs stopped by them"] > 0
     assert figures["differing runs"] == 0
@@ -74,7 +74,7 @@ def test_no_part_of_a_checkpoint_can_be_forgotten(loop, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_corrupted_checkpoint_gives_way_to_the_older_one_and_that_is_said(tmp_path):
+def test_a_corrupted_checkpoint_is_a_warning_and_the_older_one_is_used(tmp_path):
     figures = faults.corruption_campaign(tmp_path, 300)
     assert figures["corruptions"] > 250
     assert len(figures["by way"]) == 14
@@ -104,11 +104,11 @@ def test_if_no_checkpoint_is_whole_the_error_says_why_of_each(tmp_path):
         ({"env": gym.make("CartPole-v1", sutton_barto_reward=True)}, r"^env is .*, got .*'sutton_barto_reward': True"),
         ({"env": CartPole()}, r"^env is .*, got \{'name': 'CartPole \(functional\)'"),
         ({"env": gym.make("MountainCar-v0")}, r"^env is .*, got \{'name': 'MountainCar-v0'"),
-        ({"resume": False}, r"^checkpoint .*0040\.npz is there already; resume=True"),
+        ({"resume": False}, r"^checkpoint .*0040\.npz exists already; resume=True"),
     ],
     ids=lambda x: "",
 )
-def test_a_checkpoint_of_another_run_is_refused_by_what_differs(change, message, tmp_path):
+def test_a_checkpoint_of_another_run_is_an_error_that_names_the_difference(change, message, tmp_path):
     play("Gymnasium loop", tmp_path, QUICK)
     before = final_bits(tmp_path)
     with pytest.raises(ValueError, match=message):
@@ -116,13 +116,13 @@ def test_a_checkpoint_of_another_run_is_refused_by_what_differs(change, message,
     assert final_bits(tmp_path) == before
 
 
-def test_how_it_is_rendered_makes_no_other_environment(tmp_path):
+def test_another_render_mode_is_the_same_environment(tmp_path):
     play("Gymnasium loop", tmp_path, QUICK)
     env = gym.make("CartPole-v1", render_mode="rgb_array")
     assert len(play(None, tmp_path, dataclasses.replace(QUICK, num_episodes=41), env=env).episodes) == 41
 
 
-def test_a_run_that_is_over_is_handed_back_as_it_is(tmp_path, capsys):
+def test_a_finished_run_is_returned_unchanged(tmp_path, capsys):
     config = Config(num_episodes=60, batch_size=8, solved_reward=3.5)
     env = Corridor(length=100, limit=4)
     first = train(env, config, verbose=0, checkpoint=tmp_path)
@@ -179,10 +179,10 @@ class Doubled(gym.RewardWrapper):
 
 
 @pytest.mark.parametrize("other", [Paying(2), Paying(np.float32(2)), Paying([1]), Doubled(Paying(1))])
-def test_an_environment_made_otherwise_is_another(other, tmp_path):
+def test_an_environment_with_other_arguments_is_another(other, tmp_path):
     config = dataclasses.replace(QUICK, batch_size=4)
     play(None, tmp_path, config, env=Paying(1))
-    play(None, tmp_path, config, env=Paying(np.int64(1)))  # is the same
+    play(None, tmp_path, config, env=Paying(np.int64(1)))  # an equal argument of another type
     with pytest.raises(ValueError, match=r"^env is "):
         play(None, tmp_path, config, env=other)
 
@@ -219,7 +219,7 @@ def test_what_callbacks_change_is_kept(tmp_path):
 
 
 class LastWord(keras.callbacks.Callback):
-    """Changes the agent at the very end, as EarlyStopping may."""
+    """Changes the agent at the end of training, as EarlyStopping may."""
 
     def on_train_end(self, logs=None):
         self.model.set_weights([w + 1 for w in self.model.get_weights()])
@@ -235,7 +235,7 @@ def test_what_a_callback_does_at_the_end_is_saved_too(loop, tmp_path):
 
 
 class Meanwhile(keras.callbacks.Callback):
-    """Does something in the middle of a run."""
+    """Calls a function in the middle of a run."""
 
     def __init__(self, do):
         super().__init__()
@@ -259,7 +259,7 @@ def test_a_second_run_is_refused_while_one_writes_in_the_folder(tmp_path):
     (tmp_path / ".lock").write_text("left by a process that has died")
     run = play("Gymnasium loop", tmp_path, QUICK, callbacks=[Meanwhile(try_to_join)])
     assert refused == [True, True]
-    assert fingerprint(play("Gymnasium loop", tmp_path, QUICK)) == fingerprint(run)  # and now it is free
+    assert fingerprint(play("Gymnasium loop", tmp_path, QUICK)) == fingerprint(run)  # the folder is free now
 
 
 @pytest.mark.slow
@@ -306,16 +306,16 @@ def test_only_older_files_of_the_same_run_are_deleted(tmp_path):
 def test_a_fault_of_the_disk_is_one_warning_and_leaves_the_last_state_and_no_litter(name, tmp_path):
     if not faults.is_possible(name, tmp_path):
         pytest.skip("this process may not do that")
-    run, resumed, said, left = faults.under_disk_fault(name, tmp_path)
-    assert len(said) == 1
-    assert re.match(r"checkpoint after episode \d+ could not be saved \(.*\); the last one stays, and", said[0])
+    run, resumed, messages, left = faults.under_disk_fault(name, tmp_path)
+    assert len(messages) == 1
+    assert re.match(r"checkpoint after episode \d+ could not be saved \(.*\); the last one stays, and", messages[0])
     assert left == ["checkpoint-0000000005.npz", "checkpoint-0000000010.npz"]
     assert fingerprint(resumed) == fingerprint(run)
 
 
 def test_a_warning_comes_again_if_saving_works_in_between(tmp_path):
     class Blocker(keras.callbacks.Callback):
-        """A folder stands where the next file should be, twice."""
+        """Makes a folder with the name of the next file, twice."""
 
         def on_epoch_end(self, epoch, logs=None):
             if epoch in (6, 16):
@@ -341,7 +341,7 @@ def test_a_folder_that_cannot_be_one_is_an_error_before_any_work(tmp_path):
         train(env, QUICK, checkpoint=tmp_path, checkpoint_every=0)
 
 
-def test_a_folder_that_is_removed_on_the_way_is_made_anew(tmp_path):
+def test_a_folder_that_is_removed_during_the_run_is_made_again(tmp_path):
     class Remover(keras.callbacks.Callback):
         def on_epoch_end(self, epoch, logs=None):
             if epoch == 12:
@@ -417,10 +417,10 @@ def test_a_network_that_cannot_be_trusted_is_not_loaded(tmp_path):
     good, silent = path.read_bytes(), 0
     rng = np.random.default_rng(0)
     for _ in range(100):
-        spoilt = bytearray(good)
-        spoilt[rng.integers(len(good))] ^= 1 << rng.integers(8)
-        path.write_bytes(spoilt)
-        with contextlib.suppress(ValueError):  # a flip may also be in what is not the network, such as a date
+        damaged = bytearray(good)
+        damaged[rng.integers(len(good))] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        with contextlib.suppress(ValueError):  # the flipped bit may be outside the network, for example in a date
             loaded = load_q_network(path).get_weights()
             silent += any((a != b).any() for a, b in zip(loaded, network.get_weights(), strict=True))
     assert silent == 0

@@ -96,7 +96,7 @@ def test_a_run_folder_holds_what_one_expects():
 
 
 @pytest.mark.slow
-def test_compiled_episodes_are_those_of_the_functional_twin():
+def test_the_option_compiled_plays_the_functional_twin():
     assert dqn_keras(f"train CartPole-v1 --seed 3 --compiled --tensorboard {SHORT}") == 0
     config = Config(num_episodes=12, batch_size=16, solved_reward=1000)
     rewards = train(CartPole(), config, seed=3, verbose=0).rewards.tolist()
@@ -159,7 +159,7 @@ def test_environments_take_arguments_and_wrappers(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_study_is_kept_gone_on_with_and_drawn(capsys):
+def test_a_study_is_saved_continued_and_drawn(capsys):
     line = "study CartPole-v1 --compiled --out s --workers 1 --num-episodes 60 --solved-reward 10 --quiet"
     assert dqn_keras(f"{line} --seeds 2") == 0
     assert "Share of seeds solved within 60 episodes: 1.000" in capsys.readouterr().out
@@ -171,7 +171,7 @@ def test_a_study_is_kept_gone_on_with_and_drawn(capsys):
 
 
 @pytest.mark.slow
-def test_a_sweep_is_kept_gone_on_with_and_drawn(capsys):
+def test_a_sweep_is_saved_continued_and_drawn(capsys):
     line = "sweep CartPole-v1 --compiled --out s --workers 1 --num-episodes 60 --evaluate --quiet"
     assert dqn_keras(f"{line} --vary hidden_units=8,8x8 double=False,True --seeds 1") == 0
     table = capsys.readouterr().out
@@ -206,7 +206,7 @@ def test_formulas_and_presets_of_a_run_are_kept_for_its_resume():
 
 
 @pytest.mark.slow
-def test_a_longer_run_is_the_run_that_had_been_longer_from_the_start():
+def test_a_run_made_longer_equals_one_that_was_longer_from_the_start():
     dqn_keras(f"train CartPole-v1 --seed 3 --out whole {SHORT}")
     dqn_keras(f"train CartPole-v1 --seed 3 --out parts {SHORT} --num-episodes 7")
     assert dqn_keras("resume parts --num-episodes 12 --quiet") == 0
@@ -214,7 +214,7 @@ def test_a_longer_run_is_the_run_that_had_been_longer_from_the_start():
 
 
 def differing(*folders):
-    """In what the results of two runs differ; the speeds may."""
+    """Returns what differs in the results of two runs, apart from speeds."""
     logs = [[{k: v for k, v in row.items() if k != "steps_per_second"} for row in log(folder)] for folder in folders]
     weights = [load_q_network(Path(folder, "agent.keras")).get_weights() for folder in folders]
     return [
@@ -232,22 +232,22 @@ def differing(*folders):
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)]
 )
-def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(number, code):
+def test_a_stopped_run_is_resumed_exactly(number, code):
     options = "--seed 3 --num-episodes 330 --solved-reward 1000"
     command = [sys.executable, "-m", "dqn_keras", "train", "CartPole-v1", "--out", "run", *options.split()]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     with killed_after(600, process):
         assert any(line.startswith("Episode 100") for line in process.stdout)
         process.send_signal(number)
-        _, said = process.communicate()
+        _, printed = process.communicate()
     assert process.returncode == code
     if code == 130:
-        assert said == "Interrupted; the finished part is saved. To continue: dqn-keras resume run\n"
+        assert printed == "Interrupted; the finished part is saved. To continue: dqn-keras resume run\n"
         assert {"agent.keras", "curve.png"} <= {path.name for path in Path("run").iterdir()}
         assert [int(row["epoch"]) for row in log("run")] == list(range(len(log("run"))))
     else:
         with Path("run/log.csv").open("a") as file:
-            file.write("999,1.0,0.")  # the power went in the middle of a line
+            file.write("999,1.0,0.")  # a power cut in the middle of a line
         assert dqn_keras("plot run") == 0
     assert 100 <= len(log("run")) < 330
     assert dqn_keras("resume run --quiet") == 0
@@ -259,22 +259,22 @@ ERRORS = {
     "train CartPole-v1 --tau 3": "tau must be a finite number above 0, at most 1, got 3.0",
     "train Nope-v1": "Environment `Nope` doesn't exist.",
     "train no_module:Nope-v1": "No module named 'no_module'",
-    "train FrozenLake-v1": "FrozenLake-v1 has the observation space Discrete(16); --flatten makes one axis of it",
-    "train Pendulum-v1": "env Pendulum-v1 has the action space Box(-2.0, 2.0, (1,), float32); supported is Discrete",
+    "train FrozenLake-v1": "FrozenLake-v1 has the observation space Discrete(16); use --flatten",
+    "train Pendulum-v1": "env Pendulum-v1 has the action space Box(-2.0, 2.0, (1,), float32); it must be Discrete",
     "train CarRacing-v3 --env-args continuous=False": "env CarRacing-v3 has observations of shape (96, 96, 3)",
     "train CartPole-v1 --env-args gravity": "env_args must be of the form NAME=VALUE, got 'gravity'",
     "train CartPole-v1 --env-args wings=2": "CartPole-v1 wings=2 cannot be made: TypeError: CartPoleEnv.__init__() got",
     "train LunarLander-v3 --env-args gravity=5": "LunarLander-v3 gravity=5 cannot be made: AssertionError: gravity",
     "train FrozenLake-v1 --flatten --env-args map_name=9x9": "FrozenLake-v1 map_name='9x9' cannot be made: KeyError",
     "study CartPole-v1 --num-episodes 20": "num_episodes must be at least solved_window=50 in a study",
-    "train LunarLander-v3 --compiled": "compiled episodes are for CartPole-v1, Acrobot-v1, MountainCar-v0 as they are",
+    "train LunarLander-v3 --compiled": "compiled is only for CartPole-v1, Acrobot-v1, MountainCar-v0, without",
     "train CartPole-v1 --seed -1": "seed must be a whole number from 0",
     "train CartPole-v1 --loss hubr": "loss must be a name that Keras knows, such as 'mse', got 'hubr'",
-    "train Nope-v1 --preset": "preset is there for CartPole-v1",
+    "train Nope-v1 --preset": "preset exists for CartPole-v1",
     "train CartPole-v1 --preset --tau 7": "tau must be a finite number above 0, at most 1, got 7.0",
     "train CartPole-v1 --steps-count-from run --num-steps 10": "batch_size must be at most num_steps = 10, got 64",
-    "sweep CartPole-v1 --vary tua=1": "vary must be of the form NAME=VALUE,VALUE with a name of --help, got 'tua=1'",
-    "sweep CartPole-v1 --vary tau": "vary must be of the form NAME=VALUE,VALUE with a name of --help, got 'tau'",
+    "sweep CartPole-v1 --vary tua=1": "vary must be of the form NAME=VALUE,VALUE with a name from --help, got 'tua=1'",
+    "sweep CartPole-v1 --vary tau": "vary must be of the form NAME=VALUE,VALUE with a name from --help, got 'tau'",
     "sweep CartPole-v1 --vary tau=0.1,x": "tau must be a finite number above 0, at most 1, got 'x'",
     "sweep CartPole-v1 --vary loss=mse,x": "settings['loss=x']: loss must be a name that Keras knows",
     "sweep CartPole-v1 --vary double=1": "double must be True or False, got 1",
@@ -326,7 +326,7 @@ SLIPS = {
 
 
 @pytest.mark.parametrize(("line", "hint"), SLIPS.items(), ids=SLIPS)
-def test_a_common_slip_gets_a_hint(line, hint, capfd):
+def test_a_common_mistake_gets_a_hint(line, hint, capfd):
     assert dqn_keras(line) == 2
     assert capfd.readouterr().err.endswith(f"╯\ndqn-keras: {hint}\n")
 
@@ -342,28 +342,28 @@ def test_an_option_that_cannot_be_read_is_explained(line, parts, capfd):
     assert not any(Path.cwd().iterdir())
 
 
-def test_folders_that_are_not_whole_are_told(capfd):
+def test_an_incomplete_folder_is_a_clear_error(capfd):
     dqn_keras(f"train CartPole-v1 --seed 3 --out a {SHORT}")
     capfd.readouterr()
-    told = []
+    errors = []
 
-    def hear(line):
+    def fail(line):
         assert dqn_keras(line) == 2
-        told.append(capfd.readouterr().err)
+        errors.append(capfd.readouterr().err)
 
-    hear(f"train CartPole-v1 --out a {SHORT}")
+    fail(f"train CartPole-v1 --out a {SHORT}")
     Path("a/agent.keras").unlink()
-    hear("evaluate a")
+    fail("evaluate a")
     Path("a/log.csv").unlink()
-    hear("plot a")
+    fail("plot a")
     Path("a/config.json").write_text('{"seed": 3}')
-    hear("evaluate a")
-    assert told[0].startswith("dqn-keras: a already holds a run: `dqn-keras resume a` continues it")
-    assert told[1].startswith(
+    fail("evaluate a")
+    assert errors[0].startswith("dqn-keras: a already holds a run: `dqn-keras resume a` continues it")
+    assert errors[1].startswith(
         "dqn-keras: a has no agent.keras: its run is in progress or was killed; to continue it: dqn-keras resume"
     )
-    assert told[2] == "dqn-keras: a has no episode in log.csv yet\n"
-    assert told[3].startswith("dqn-keras: a/config.json is not as `dqn-keras train` writes it: 'config'")
+    assert errors[2] == "dqn-keras: a has no episode in log.csv yet\n"
+    assert errors[3].startswith("dqn-keras: a/config.json is not what `dqn-keras train` writes: 'config'")
 
 
 @pytest.mark.slow
@@ -382,8 +382,8 @@ def test_a_log_that_was_lost_or_damaged_is_made_again():
     lines = Path("a/log.csv").read_text().splitlines(keepends=True)
     Path("a/log.csv").write_text("".join([*lines[:4], "more\n", "5,1,x\n", *lines[8:10], lines[10][:20]]))
     assert dqn_keras("resume a --quiet") == 0
-    told = [{k: v for k, v in row.items() if k != "steps_per_second"} for row in log("a")]
-    assert told == [{k: v for k, v in row.items() if k != "steps_per_second"} for row in whole]
+    rows = [{k: v for k, v in row.items() if k != "steps_per_second"} for row in log("a")]
+    assert rows == [{k: v for k, v in row.items() if k != "steps_per_second"} for row in whole]
 
 
 def test_a_longer_run_that_is_refused_changes_nothing():
@@ -394,7 +394,7 @@ def test_a_longer_run_that_is_refused_changes_nothing():
 
 
 @pytest.mark.slow
-def test_nobody_reading_is_no_traceback():
+def test_a_closed_output_is_not_a_traceback():
     script = (
         f"{shlex.quote(sys.executable)} -m dqn_keras train CartPole-v1 --seed 3 --out a --num-episodes 500 | head -1"
     )

@@ -48,13 +48,13 @@ PUBLISHED = {
     scope="module", params=[{}, OTHERS, PUBLISHED], ids=["the original's parameters", "others", "a published rhythm"]
 )
 def run(request):
-    """A hundred and some episodes, every transition of them kept."""
+    """Returns a run of 120 episodes whose memory holds every transition."""
     config = Config(**{"num_episodes": 120, "solved_reward": 1e9, **request.param})
     return train(CartPole(), config, seed=0, verbose=0)
 
 
 def transitions(run):
-    """The memory, oldest first, cut into episodes."""
+    """Returns the memory, oldest first, cut into episodes."""
     batch = unpack(run.agent.memory.rows[: len(run.agent.memory)], run.agent.memory.state_shape)
     ends = np.cumsum([episode.steps for episode in run.episodes])
     assert ends[-1] == len(run.agent.memory)
@@ -217,7 +217,7 @@ def test_the_stop_rule_holds_after_each_episode_with_the_weights_of_that_moment(
     assert run.solved_at == len(run.rewards) - 1
     assert means[-1] > 30
     assert (means[:-1] <= 30).all()
-    # the same episodes, none after: weights, memory and counters are of that moment
+    # the same episodes and none after them: weights, memory and counters belong to that moment
     stopped = train(CartPole(), Config(num_episodes=len(run.rewards), solved_reward=1e9), seed=0, verbose=0)
     assert fingerprint(run) == fingerprint(stopped)
     assert run.agent.num_updates == run.agent.optimizer.iterations.numpy()
@@ -245,7 +245,7 @@ def test_a_full_memory_forgets_the_oldest():
 
 
 class Counter(FuncEnv):
-    """Counts up; ends at 10. Written as a reader would, options replacing its parts; its actions are 5 and 6."""
+    """Counts up to 10, with actions 5 and 6. Written as a user would write it; options replace its parts."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
     action_space = gym.spaces.Discrete(2, start=5)
@@ -275,7 +275,7 @@ def test_any_functional_environment_trains():
     assert set(np.unique(run.agent.memory.rows[:200, 2])) == {0.0, 1.0}
     short = train(Counter(), Config(num_episodes=20, max_steps=4, solved_reward=1e9), seed=0, verbose=0)
     assert [e.steps for e in short.episodes] == [4] * 20
-    assert not short.agent.memory.rows[:, 4].any()  # left, not terminated
+    assert not short.agent.memory.rows[:, 4].any()  # cut short, not terminated
 
 
 @pytest.mark.slow
@@ -288,14 +288,14 @@ def test_a_bad_number_stops_the_run_and_says_where(bad):
 
 
 class Paying(Counter):
-    """Its fourth reward is too large for float32."""
+    """Gives a fourth reward that is too large for float32."""
 
     def reward(self, state, action, next_state, rng, params=None):
         return tf.where(next_state["count"] == 4, tf.constant(1e39, tf.float64), 1.0)
 
 
 @pytest.mark.slow
-def test_a_bad_reward_is_told_from_a_bad_observation():
+def test_a_bad_reward_and_a_bad_observation_have_different_errors():
     with pytest.raises(ValueError, match=r"^env Paying: a reward was not finite in episode 0, step 3"):
         train(Paying(), Config(num_episodes=20), seed=0, verbose=0)
 
@@ -308,7 +308,7 @@ def test_a_weight_that_becomes_nan_stops_the_run_in_the_same_update(make_env):
 
 
 class Noisy(Counter):
-    """Its observations are random."""
+    """Gives random observations."""
 
     def observation(self, state, rng, params=None):
         return tf.cast(state["count"], tf.float32)[None] + tf.random.stateless_normal([1], rng)
@@ -347,7 +347,7 @@ def test_without_xla_the_error_says_what_works(monkeypatch, cartpole):
 
     require_xla.cache_clear()
     monkeypatch.setattr("dqn_keras._engine.tensorflow._compile_something", no_compiler)
-    config = Config(num_episodes=9, batch_size=8, gamma=0.123)  # of which no program is there yet
+    config = Config(num_episodes=9, batch_size=8, gamma=0.123)  # no program was compiled for it yet
     for env in (CartPole(), cartpole):
         with pytest.raises(RuntimeError, match=r"XLA cannot compile on this machine; Config\(jit_compile=False\)"):
             train(env, config, seed=0, verbose=0)

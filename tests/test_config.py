@@ -44,12 +44,12 @@ def test_defaults_are_the_originals_numbers():
 
 
 @given(bad_fields)
-def test_a_bad_field_is_refused_by_name(field):
+def test_a_bad_field_is_an_error_that_names_it(field):
     refused(*field)
 
 
 @given(bad_hidden_units)
-def test_bad_units_are_refused_by_name(value):
+def test_bad_units_are_an_error_that_names_them(value):
     with pytest.raises((TypeError, ValueError), match=r"^hidden_units"):
         Config(hidden_units=value)
 
@@ -62,7 +62,7 @@ def test_zero_is_refused_where_nothing_would_be_learned(name):
 @pytest.mark.parametrize(
     "value", [64, None, "64", (), [], (0,), (64, -1), (64.0,), (True,), ("64",), {64}, np.ones((2, 2))]
 )
-def test_bad_hidden_units_are_refused_by_name(value):
+def test_bad_hidden_units_are_an_error_that_names_them(value):
     with pytest.raises((TypeError, ValueError), match=r"^hidden_units"):
         Config(hidden_units=value)
 

@@ -18,7 +18,7 @@ from tests.helpers.environments import Corridor
 
 
 @pytest.mark.parametrize("is_double", [False, True], ids=["DQN", "Double DQN"])
-def test_the_metrics_are_those_of_the_batch_before_the_step_by_the_targets_in_use(random_batch, is_double):
+def test_the_metrics_are_measured_on_the_batch_before_the_step_with_the_targets_in_use(random_batch, is_double):
     batch = random_batch(32)
     networks = make_networks(4, 2, seed=0)
     networks[1].set_weights([0.1 - w for w in networks[1].get_weights()])
@@ -45,8 +45,8 @@ def test_an_episode_is_the_mean_of_its_updates_and_their_highest_q():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make_env", [lambda: gym.make("CartPole-v1"), CartPole], ids=["Gymnasium", "compiled"])
-def test_the_terminal_share_is_that_of_the_memory(make_env):
-    # With as many transitions as whole episodes: the memory's oldest may be of the middle of one, ended later or not.
+def test_the_terminal_share_is_the_share_in_the_memory(make_env):
+    # One memory holds whole episodes, the other begins in the middle of one.
     for memory_size in (100_000, 400):
         run = train(make_env(), Config(num_episodes=60, memory_size=memory_size, batch_size=16), seed=0, verbose=0)
         memory = run.agent.memory
@@ -68,19 +68,19 @@ def test_the_moving_average_is_over_the_window_of_the_stop_rule():
     ("rewards", "gamma", "bounds"),
     [
         ([1.0, 2.0, 1.0], 0.5, [2, 4, 4]),  # forever
-        ([-1.0, -1.0], 0.5, [-1, -1]),  # once, and then the end
+        ([-1.0, -1.0], 0.5, [-1, -1]),  # one step, then the end
         ([-1.0, 0.0], 0.9, [-1, 0]),
         ([1.0], 1.0, [math.inf]),
         ([0.0, -1.0], 1.0, [0, 0]),
     ],
 )
-def test_the_bound_is_the_highest_return_that_there_can_be(rewards, gamma, bounds):
+def test_the_bound_is_the_highest_possible_return(rewards, gamma, bounds):
     log = Log(Config(gamma=gamma))
     assert [log.add(episode(max_reward=r), 1.0)["q_bound"] for r in rewards] == pytest.approx(bounds)
 
 
 @pytest.mark.slow
-def test_both_loops_note_the_highest_reward_and_the_end():
+def test_both_loops_record_the_highest_reward_and_termination():
     run = train(Corridor(length=9, limit=6, reward=lambda t: [0, 5, 1][t % 3]), Config(num_episodes=30), 0, verbose=0)
     assert {e.max_reward for e in run.episodes} == {5.0}
     assert not any(e.terminated for e in run.episodes)

@@ -18,7 +18,7 @@ BLOCKS = [
     for page in PAGES
     for number, (kind, block) in enumerate(BLOCK.findall(page.read_text()), start=1)
 ]
-OPTIONAL = ("onnxruntime", "optuna", "tf2onnx", "wandb")  # a block that names one runs where it is installed
+OPTIONAL = ("onnxruntime", "optuna", "tf2onnx", "wandb")  # a block that names one runs only if it is installed
 MADE = {  # by docs/hooks.py, from where it is in the repository
     *(path.relative_to(ROOT) for path in [*ROOT.glob("results/**/*.*"), *ROOT.glob("notebooks/*.ipynb")]),
     *(path.relative_to(ROOT).with_suffix(".md") for path in ROOT.glob("notebooks/*.ipynb")),
@@ -55,7 +55,7 @@ def test_the_links_of_the_docs_lead_somewhere(page):
 
 
 def documented():
-    """What the reference documents: the objects that its directives name."""
+    """Yields the objects that the reference documents, as named in its directives."""
     for page in (DOCS / "reference").glob("*.md"):
         for path in re.findall(r"^::: (\S+)$", page.read_text(), re.MULTILINE):
             try:

@@ -43,8 +43,8 @@ UNSUPPORTED = [
 
 
 @pytest.mark.parametrize(("field", "space"), UNSUPPORTED)
-def test_an_unsupported_space_is_named_with_what_is_supported(field, space):
-    with pytest.raises(ValueError, match=rf"env Corridor has the {field.replace('_', ' ')} .*; supported is"):
+def test_an_unsupported_space_is_an_error_that_says_what_is_supported(field, space):
+    with pytest.raises(ValueError, match=rf"env Corridor has the {field.replace('_', ' ')} .*; it must be"):
         CheckedEnv(Corridor(**{field: space}))
 
 
@@ -59,7 +59,7 @@ def test_an_error_of_the_environments_own_says_where():
     assert caught.value.__notes__ == ["raised by env Corridor in episode 0, step 3"]
 
 
-def test_what_is_no_environment_is_refused():
+def test_what_is_not_an_environment_is_refused():
     for thing in ("CartPole-v1", None, gym.make_vec("CartPole-v1", num_envs=2)):
         with pytest.raises(TypeError, match=r"^env must be a gymnasium\.Env, got"):
             CheckedEnv(thing)

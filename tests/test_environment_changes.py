@@ -13,7 +13,7 @@ from tests.helpers.short_runs import QUICK
 
 
 class Drift(FuncEnv):
-    """A number that grows by what the class, the object and an object that it holds say."""
+    """Grows a number by the sum of a class attribute, an attribute, and an attribute of an object that it holds."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
     action_space = gym.spaces.Discrete(2)

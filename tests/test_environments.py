@@ -10,7 +10,7 @@ RNG = tf.constant([0, 0], tf.int64)
 
 
 def random_states(name, rng, count):
-    """States all over the space, ends of episodes included."""
+    """Returns states all over the space, including ends of episodes."""
     if name == "CartPole":
         return rng.uniform([-2.5, -3, -0.25, -3], [2.5, 3, 0.25, 3], (count, 4))
     if name == "Acrobot":

@@ -24,7 +24,7 @@ def test_returns_are_undiscounted_sums_of_greedy_episodes():
     assert env.actions == [1] * 15
 
 
-def test_an_episode_that_never_ends_is_left():
+def test_an_episode_that_never_ends_is_cut_short():
     assert evaluate(Corridor(), always(0), num_episodes=1, seed=0, max_steps=7).tolist() == [7.0]
 
 
@@ -92,7 +92,7 @@ def test_functional_episodes_are_cut_by_max_steps_and_repeat():
     assert not np.array_equal(first, other)
 
 
-def test_a_network_and_an_environment_of_ones_own_are_evaluated_as_they_are():
+def test_an_own_network_and_environment_are_evaluated_as_they_are():
     own = keras.Sequential([keras.Input((1,)), keras.layers.Dense(2, activation="tanh")])
     own.set_weights([np.zeros((1, 2)), np.array([0.0, 1.0])])  # always the action of index 1
     assert evaluate(Paying(), own, 3, seed=0).tolist() == [6.0] * 3
@@ -103,7 +103,7 @@ def test_a_network_and_an_environment_of_ones_own_are_evaluated_as_they_are():
 
 
 class Paying(FuncEnv):
-    """Pays `amount` for action 8 and ends after 6 of them; the actions are 7 and 8."""
+    """Gives the reward `amount` for action 8 and ends after six of these; the actions are 7 and 8."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,))
     action_space = gym.spaces.Discrete(2, start=7)

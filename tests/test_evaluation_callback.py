@@ -1,4 +1,4 @@
-"""Evaluation: greedy returns during a run, and the best network kept, in both loops."""
+"""The callback Evaluation: greedy returns during a run and the best network, in both loops."""
 
 import csv
 import itertools
@@ -36,7 +36,7 @@ def weights(network):
 
 
 class Snapshots(keras.callbacks.Callback):
-    """Notes the environment steps and the weights at the start and after each episode."""
+    """Records the environment steps and the weights at the start and after each episode."""
 
     def on_train_begin(self, logs=None):
         self.steps, self.weights = [0], [weights(self.model)]
@@ -46,7 +46,7 @@ class Snapshots(keras.callbacks.Callback):
         self.weights.append(weights(self.model))
 
 
-def test_training_is_the_same_to_the_bit(env, tmp_path):
+def test_training_with_evaluations_is_the_same_bit_for_bit(env, tmp_path):
     run, other = play(env, evaluation(tmp_path / "best.keras")), play(env)
     np.testing.assert_array_equal(run.rewards, other.rewards)
     np.testing.assert_array_equal(weights(run.q_network), weights(other.q_network))
@@ -55,7 +55,7 @@ def test_training_is_the_same_to_the_bit(env, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_network_with_random_state_of_its_own_is_trained_the_same():
+def test_a_network_with_random_state_is_trained_the_same():
     @keras.saving.register_keras_serializable("test_evaluation_callback")
     class Noise(keras.layers.Layer):
         def __init__(self, **arguments):
@@ -90,7 +90,7 @@ def test_the_file_holds_the_network_of_the_best_evaluation(env, tmp_path):
     greedy, snapshots = evaluation(tmp_path / "kept" / "best.keras"), Snapshots()
     play(env, greedy, snapshots)
     best = int(np.argmax(greedy.returns))
-    assert 0 < best < len(greedy.returns) - 1  # so that neither the first nor the last network would do
+    assert 0 < best < len(greedy.returns) - 1  # neither the first nor the last network is the best
     kept = load_q_network(tmp_path / "kept" / "best.keras")
     assert evaluate(gym.make("CartPole-v1"), kept, 3, seed=0).mean() == greedy.best_return == max(greedy.returns)
     np.testing.assert_array_equal(weights(kept), snapshots.weights[snapshots.steps.index(greedy.steps[best])])
@@ -104,16 +104,16 @@ def test_of_equal_networks_the_earliest_stays(tmp_path):
     assert not np.array_equal(snapshots.weights[0], snapshots.weights[-1])
 
 
-def test_every_log_holds_the_latest_mean_return_wherever_the_callback_stands(env, tmp_path):
-    greedy, snapshots, heard = evaluation(), Snapshots(), keras.callbacks.History()
-    run = play(env, keras.callbacks.CSVLogger(tmp_path / "log.csv"), heard, snapshots, greedy)
+def test_every_log_holds_the_latest_mean_return_whatever_the_order_of_callbacks(env, tmp_path):
+    greedy, snapshots, keras_history = evaluation(), Snapshots(), keras.callbacks.History()
+    run = play(env, keras.callbacks.CSVLogger(tmp_path / "log.csv"), keras_history, snapshots, greedy)
     returns_at, expected = dict(zip(greedy.steps, greedy.returns, strict=True)), [greedy.returns[0]]
     for before, after in itertools.pairwise(snapshots.steps):
         expected.append(returns_at[after] if after // 100 > before // 100 else expected[-1])
     del expected[0]
     assert len(set(expected)) > 3
     np.testing.assert_array_equal(run.history["greedy_return"], expected)
-    np.testing.assert_array_equal(heard.history["greedy_return"], expected)
+    np.testing.assert_array_equal(keras_history.history["greedy_return"], expected)
     rows = list(csv.DictReader((tmp_path / "log.csv").open()))
     assert rows[0].keys() == {"epoch", *run.history}
     np.testing.assert_array_equal([float(row["greedy_return"]) for row in rows], expected)
@@ -160,7 +160,7 @@ def test_a_resumed_run_evaluates_where_the_whole_run_does(env, tmp_path):
 
 
 def steers(to):
-    """A network that balances the pole for about 200 steps, to 1, or topples it, to -1."""
+    """Returns a network that balances the pole for about 200 steps (1), or topples it (-1)."""
     network = make_q_network(4, 2, hidden_units=(2,), seed=0)
     network.set_weights([to * np.outer([0, 0, 1, 1], [1, -1]), np.zeros(2), np.eye(2)[::-1], np.zeros(2)])
     return network
@@ -187,7 +187,7 @@ def test_a_new_run_replaces_the_file_of_another(cartpole, tmp_path):
     assert greedy.best_return < evaluate(cartpole, steers(1), 3, seed=0).mean()
 
 
-def test_a_resumed_run_refuses_a_file_that_holds_no_network_of_it(tmp_path):
+def test_a_resumed_run_refuses_a_file_without_one_of_its_networks(tmp_path):
     best, arguments = tmp_path / "best.keras", {"checkpoint": tmp_path / "run", "resume": True}
     play(Corridor(limit=3), config=Config(num_episodes=2, batch_size=4), **arguments)
     greedy, config = Evaluation(Corridor(limit=3), 5, 1, best), Config(num_episodes=4, batch_size=4)
@@ -196,7 +196,7 @@ def test_a_resumed_run_refuses_a_file_that_holds_no_network_of_it(tmp_path):
         (lambda: best.write_bytes(best.read_bytes()[:-100]), "is not a network that can be loaded"),
     ]:
         write()
-        with pytest.raises(ValueError, match=rf"^best .*best\.keras must hold a network of the run.*{why}"):
+        with pytest.raises(ValueError, match=rf"^best .*best\.keras must hold a network of the resumed run.*{why}"):
             play(Corridor(limit=3), greedy, config=config, **arguments)
     best.unlink()
     play(Corridor(limit=3), greedy, config=config, **arguments)
@@ -214,12 +214,12 @@ def test_the_averaged_weights_of_the_end_are_evaluated(cartpole):
 @pytest.mark.slow
 @pytest.mark.parametrize(("every_steps", "num_evaluations"), [(1, 13), (10_000, 1)])
 def test_a_diverged_network_is_not_evaluated(env, every_steps, num_evaluations):
-    greedy, heard = evaluation(every_steps=every_steps), keras.callbacks.History()
-    run = play(env, greedy, heard, SpoiledVelocity(), keras.callbacks.TerminateOnNaN())
+    greedy, keras_history = evaluation(every_steps=every_steps), keras.callbacks.History()
+    run = play(env, greedy, keras_history, SpoiledVelocity(), keras.callbacks.TerminateOnNaN())
     assert run.diverged
     assert len(greedy.steps) == num_evaluations
     assert len(run.history["greedy_return"]) == len(run.rewards) == 12
-    assert math.isnan(heard.history["greedy_return"][12])
+    assert math.isnan(keras_history.history["greedy_return"][12])
 
 
 @pytest.mark.slow
@@ -235,14 +235,14 @@ def test_a_full_disk_is_a_warning_and_the_next_better_network_is_kept(env, tmp_p
                 monkeypatch.undo()
 
     greedy = evaluation(tmp_path / "best.keras", every_steps=1)
-    with pytest.warns(UserWarning, match=r"^best .* could not be written \(no space left\); the last one stays"):
+    with pytest.warns(UserWarning, match=r"^best .* could not be written \(no space left\); the earlier file stays"):
         play(env, greedy, DiskIsFull())
     kept = load_q_network(tmp_path / "best.keras")
     assert evaluate(gym.make("CartPole-v1"), kept, 3, seed=0).mean() == greedy.best_return
     assert [path.name for path in tmp_path.iterdir()] == ["best.keras"]
 
 
-def test_a_file_that_cannot_be_written_is_told_before_any_work_starts(tmp_path):
+def test_a_file_that_cannot_be_written_is_an_error_before_any_work_starts(tmp_path):
     (tmp_path / "file").touch()
     env = Corridor()
     with pytest.raises(OSError, match=r"^best .*best\.keras cannot be written"):
@@ -250,7 +250,7 @@ def test_a_file_that_cannot_be_written_is_told_before_any_work_starts(tmp_path):
     assert not env.reset_seeds
 
 
-def test_an_environment_that_does_not_fit_is_told_before_any_work_starts(cartpole):
+def test_an_environment_that_does_not_fit_is_an_error_before_any_work_starts(cartpole):
     wrapped = gym.wrappers.TimeLimit(cartpole, 10)
     for env in (cartpole, wrapped):
         with pytest.raises(
@@ -267,7 +267,7 @@ def test_an_environment_that_does_not_fit_is_told_before_any_work_starts(cartpol
 
 
 def test_two_evaluations_in_a_run_are_refused(env):
-    with pytest.raises(ValueError, match=r"^callbacks must hold one Evaluation, .* got 2$"):
+    with pytest.raises(ValueError, match=r"^callbacks must hold only one Evaluation: .* got 2$"):
         play(env, evaluation(), evaluation())
 
 

@@ -14,7 +14,7 @@ def code(notebook, tag=None):
 
 
 def signatures(cells):
-    """Every function and class of some cells, with its arguments and docstring."""
+    """Returns every function and class of some cells, with its arguments and docstring."""
     parts = [node for cell in cells for node in ast.walk(ast.parse(cell))]
     parts = [node for node in parts if isinstance(node, ast.FunctionDef | ast.ClassDef)]
     return {
@@ -46,7 +46,7 @@ def test_every_exercise_has_a_time_and_a_check():
 
 @pytest.fixture(scope="module")
 def machinery():
-    """The names of the cells that the checks need, without any training."""
+    """Returns the names that the checks need, from cells without training."""
     namespace = {}
     for cell in code(STUDENTS):
         if any(part in cell for part in ("from dqn_keras import", "class NotSolvedError", "def q_function")):
@@ -55,7 +55,7 @@ def machinery():
 
 
 def verdict(machinery, number, answer, capsys):
-    """What the check of one exercise prints about an answer."""
+    """Returns what the check of one exercise prints about an answer."""
     (cell,) = (x for x in code(STUDENTS, "folded") if f"@check({number})" in x)
     namespace = dict(machinery)
     exec(compile(answer, "answer", "exec"), namespace)
@@ -224,8 +224,8 @@ def test_the_check_of_the_probes_names_agent_and_probe(machinery, capsys):
         ("C", "choose_c", 4),
         ("D", "remember_d", 2),
     ):
-        said = verdict(namespace, 10, f"repaired = {none}\nrepaired['{name}'] = {part}", capsys)
-        assert f"not right yet: {name} fails in probe {probe}: " in said
+        printed = verdict(namespace, 10, f"repaired = {none}\nrepaired['{name}'] = {part}", capsys)
+        assert f"not right yet: {name} fails in probe {probe}: " in printed
     both = f"repaired = {none}\nrepaired['A'] = repaired['C'] = action"  # right for C, but no targets
     assert "Exercise 10: an error" in verdict(namespace, 10, both, capsys)
     assert "A, B, C, D not repaired" in verdict(namespace, 10, f"repaired = {none}\nrepaired['E'] = td_targets", capsys)
@@ -238,7 +238,7 @@ def test_the_students_version_runs_from_top_to_bottom_unsolved(capsys, monkeypat
     namespace = {}
     for cell in code(STUDENTS):
         exec(compile(cell, "notebook", "exec"), namespace)
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for number in range(1, NUM_EXERCISES + 1):
-        assert f"Exercise {number}: not solved yet: " in said
-    assert "solved: 0 of 10" in said
+        assert f"Exercise {number}: not solved yet: " in printed
+    assert "solved: 0 of 10" in printed

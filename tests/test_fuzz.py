@@ -71,5 +71,5 @@ def of_another_name(x):
         (naming, "an unprintable object", "foreign"),
     ],
 )
-def test_the_fuzz_tells_a_clear_error_from_others(function, value, kind):
+def test_the_fuzz_distinguishes_a_clear_error_from_others(function, value, kind):
     assert outcome(Door(function, lambda: {"x": 0.5}, {"x": number(0, 1)}), "x", value)[0] == kind

@@ -14,7 +14,7 @@ from tests.helpers.environments import Corridor
 
 
 class Recorded(gym.Wrapper):
-    """Writes down every action."""
+    """Records every action."""
 
     def __init__(self, env):
         super().__init__(env)
@@ -26,7 +26,7 @@ class Recorded(gym.Wrapper):
 
 
 def play(env, config, seed, num_steps):
-    """Whole episodes of the loop until at least `num_steps` are played."""
+    """Plays whole episodes of the loop until at least `num_steps` are played."""
     checked = CheckedEnv(env)
     agent = make_agent(checked.spaces.state_shape, checked.spaces.num_actions, config, seed)
     played = []
@@ -112,7 +112,7 @@ def test_updates_can_follow_the_steps_of_the_run_and_start_late():
     assert agent.num_updates == agent.optimizer.iterations.numpy() == 2 * 3
 
 
-def test_q_hat_is_a_copy_that_stays_for_a_number_of_gradient_steps():
+def test_q_hat_is_a_copy_that_stays_the_same_for_a_number_of_gradient_steps():
     config = Config(batch_size=2, steps_per_update=1, gradient_steps_per_target=5, tau=1.0, num_steps=40)
     checked = CheckedEnv(Corridor(length=100, limit=1))  # after step k, k - 1 gradient steps
     agent = make_agent((2,), 2, config, 0)

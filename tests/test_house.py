@@ -14,7 +14,7 @@ LESSON = (*HEART, "agent", "training", "evaluation", "metrics", "seeding")
 
 
 def imported_by(name):
-    """The package's modules that a module imports when it is imported, as paths."""
+    """Returns the package's modules that a module imports at its import, as paths."""
     modules = set()
     for node in TREES[name].body:
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("dqn_keras"):
@@ -33,7 +33,7 @@ def reached_from(name):
     return seen - {name}
 
 
-def test_the_lessons_heart_imports_no_wing_that_plays_keeps_or_commands():
+def test_the_lessons_heart_imports_nothing_of_loops_storage_and_cli():
     for name in HEART:
         wings = {module for module in reached_from(name) if module.startswith(("loops/", "storage/", "cli/"))}
         assert not wings, (name, wings)
@@ -56,7 +56,7 @@ def test_nothing_imports_a_file_of_tests():
         assert not re.search(r"^(from|import) tests\.test_", path.read_text(), re.MULTILINE), path
 
 
-def test_private_api_of_tensorflow_and_keras_is_in_one_room():
+def test_private_api_of_tensorflow_and_keras_is_only_in_the_engine():
     private = re.compile(
         r"\b(inference_fn|call_flat|gradient_registry|tensorflow\.python|keras\.src\.|value\.handle)\b"
         r"|\b(layer|network|optimizer|model|q_network|tf|keras)\._[a-z]\w*"
@@ -67,7 +67,7 @@ def test_private_api_of_tensorflow_and_keras_is_in_one_room():
 
 
 def length(function):
-    """Lines of its body, without the docstring."""
+    """Returns the number of lines of a function's body, without the docstring."""
     first, *rest = function.body
     is_docstring = isinstance(first, ast.Expr) and isinstance(getattr(first, "value", None), ast.Constant)
     start = rest[0].lineno if is_docstring and rest else first.lineno

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: `train` finishes the episode, saves, and ends whatever is around it, too."""
+"""Ctrl-C and SIGTERM: `train` finishes the episode, saves, and also ends the code around it."""
 
 import dataclasses
 import pickle
@@ -47,7 +47,7 @@ def test_a_request_ends_the_run_with_that_episode_and_then_raises(loop, number):
     assert [signal.getsignal(x) for x in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 
-def test_a_loop_over_seeds_ends_and_takes_no_cut_run_for_a_whole_one(cartpole):
+def test_a_loop_over_seeds_ends_and_does_not_take_a_cut_run_for_a_whole_one(cartpole):
     runs, callbacks = [], {1: [Asking(signal.SIGINT)]}
     interrupted(lambda: runs.extend(train(cartpole, QUICK, k, verbose=0, callbacks=callbacks.get(k)) for k in range(3)))
     assert [len(run.episodes) for run in runs] == [40]
@@ -97,14 +97,14 @@ def test_the_exception_can_be_sent_to_another_process_without_its_run(cartpole):
     assert str(sent) == str(error)
 
 
-def test_handlers_of_the_users_own_stay(cartpole):
-    heard = []
-    previous = signal.signal(signal.SIGTERM, lambda *_: heard.append(1))
+def test_handlers_of_the_user_stay(cartpole):
+    received = []
+    previous = signal.signal(signal.SIGTERM, lambda *_: received.append(1))
     try:
         run = train(cartpole, QUICK, SEED, verbose=0, callbacks=[Asking(signal.SIGTERM)])
     finally:
         signal.signal(signal.SIGTERM, previous)
-    assert heard == [1]
+    assert received == [1]
     assert not run.interrupted
 
 

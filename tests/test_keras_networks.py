@@ -1,4 +1,4 @@
-"""A network of any Keras layers plays as the function that it is, and all of its layers are found."""
+"""A network of any Keras layers acts with exactly the function that it computes, and all its layers are found."""
 
 import warnings
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 
 class Recorded(gym.Wrapper):
-    """Writes down every state and action."""
+    """Records every state and action."""
 
     def __init__(self):
         super().__init__(gym.make("CartPole-v1"))
@@ -46,11 +46,11 @@ def test_acting_q_hat_and_evaluate_play_the_function_that_the_network_is(name):
     np.testing.assert_allclose(chosen, values.max(axis=1), rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(run.q_hat_network(states), values, rtol=1e-5, atol=1e-5)
     network.set_weights([0 * w for w in network.get_weights()])
-    np.testing.assert_allclose(run.q_hat_network(states), values, rtol=1e-5, atol=1e-5)  # it has weights of its own
+    np.testing.assert_allclose(run.q_hat_network(states), values, rtol=1e-5, atol=1e-5)  # Q-hat has its own weights
 
 
 @pytest.mark.parametrize("name", ALL_NETWORKS)
-def test_the_public_way_to_all_layers_finds_the_same_that_compute(name):
+def test_the_public_way_to_all_layers_finds_the_same_layers(name):
     network = ALL_NETWORKS[name]()
 
     def found(layers):
@@ -63,11 +63,11 @@ def test_the_public_way_to_all_layers_finds_the_same_that_compute(name):
 
 
 @pytest.mark.parametrize("name", ALL_NETWORKS)
-def test_a_layer_that_differs_in_training_is_told_once_and_no_other_is(name, random_batch):
+def test_a_layer_that_differs_in_training_is_one_warning_and_no_other_layer_is(name, random_batch):
     q_network, q_hat_network = two_of(ALL_NETWORKS[name])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for _ in range(2):
             learn(random_batch(), 0.9, q_network, q_hat_network, keras.optimizers.SGD(0.01), jit_compile=False)
-    told = [str(w.message) for w in caught if "inference mode" in str(w.message)]
-    assert len(told) == (name in INFERENCE_ONLY)
+    messages = [str(w.message) for w in caught if "inference mode" in str(w.message)]
+    assert len(messages) == (name in INFERENCE_ONLY)

@@ -1,4 +1,4 @@
-"""Whatever Keras offers as a network, an optimizer or a loss does here what it does in an eager Keras step."""
+"""Every network, optimizer and loss of Keras computes here the same as in an eager Keras step."""
 
 import keras
 import numpy as np

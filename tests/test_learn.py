@@ -129,7 +129,7 @@ def test_the_gradient_agrees_with_the_oracle_and_is_qs_alone(random_batch):
         assert np.linalg.norm(a.numpy() - b) < 1e-5 * np.linalg.norm(b)
 
 
-def test_every_kind_of_five_is_taken_and_learns_the_same(random_batch):
+def test_any_five_arrays_are_accepted_and_learn_the_same(random_batch):
     arrays = random_batch()
     kinds = [
         arrays,
@@ -149,7 +149,7 @@ def test_every_kind_of_five_is_taken_and_learns_the_same(random_batch):
 
 
 @pytest.mark.parametrize("optimizer", [keras.optimizers.SGD(0.1), keras.optimizers.RMSprop(), keras.optimizers.AdamW()])
-def test_any_optimizer_will_do(optimizer, random_batch):
+def test_any_optimizer_works(optimizer, random_batch):
     q_network, q_hat_network, _ = agent()
     batch = random_batch()
     losses = [learn(batch, 0.0, q_network, q_hat_network, optimizer).numpy() for _ in range(20)]
@@ -171,7 +171,7 @@ def test_agents_do_not_touch_one_another(random_batch):
 
 
 @pytest.mark.slow
-def test_one_trace_for_all_agents_alike_whatever_the_batch(random_batch):
+def test_equal_agents_share_one_trace_for_all_batch_sizes(random_batch):
     learn(random_batch(), 0.95, *agent())
     before = len(_shared)
     for i, batch_size in enumerate([64, 64, 32, 1, 64, 64, 64]):
@@ -181,7 +181,7 @@ def test_one_trace_for_all_agents_alike_whatever_the_batch(random_batch):
     assert len(_shared) == before
 
 
-def test_agents_that_differ_in_more_than_numbers_have_programs_of_their_own(random_batch):
+def test_agents_that_differ_in_more_than_numbers_have_their_own_programs(random_batch):
     batch, updates = random_batch(), []
     for optimizer in (keras.optimizers.Adam(0.01), keras.optimizers.Adam(0.01, beta_1=0.0, clipnorm=1e-3)):
         q_network, q_hat_network, _ = agent()
@@ -256,7 +256,7 @@ def test_what_would_be_silently_wrong_is_refused_and_changes_nothing(spoil, mess
     assert all(map(np.array_equal, before, networks[0].get_weights()))
 
 
-def test_networks_that_do_not_belong_together_are_refused(random_batch):
+def test_networks_that_do_not_match_are_refused(random_batch):
     q_network, q_hat_network, optimizer = agent()
     batch = random_batch()
     with pytest.raises(ValueError, match="a second network"):
@@ -275,7 +275,7 @@ def test_networks_that_do_not_belong_together_are_refused(random_batch):
         learn(batch, 0.95, q_network, q_hat_network, "adam")
     with pytest.raises(TypeError, match=r"^q_network must be a Keras model, got None"):
         learn(batch, 0.95, None, q_hat_network, optimizer)
-    with pytest.raises(ValueError, match=r"^optimizer must be a new one, or one that was built for this q_network"):
+    with pytest.raises(ValueError, match=r"^optimizer must be new or built for this q_network, got"):
         learn(batch, 0.95, *make_networks(4, 2), optimizer)
 
 

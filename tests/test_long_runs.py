@@ -1,4 +1,4 @@
-"""Agents, runs and studies that are over leave nothing behind."""
+"""Finished agents, runs and studies leave nothing behind."""
 
 import pytest
 

@@ -55,6 +55,6 @@ def test_q_function_takes_any_network(rng):
     np.testing.assert_allclose(q_function(network)(state), network(state[None]).numpy()[0], rtol=1e-5)
 
 
-def test_a_network_that_does_not_fit_is_told():
+def test_a_network_that_does_not_fit_is_an_error():
     with pytest.raises(ValueError, match=r"states of shape \(4,\) to 2 actions, got input \(4,\) and output \(3,\)"):
         check_fits(make_q_network(4, 3), (4,), 2)

@@ -1,4 +1,4 @@
-"""What an environment returns is never silently nonsense: it is an error, or a warning that names it."""
+"""Nonsense from an environment is never silent: it is an error or a warning that names it."""
 
 import datetime
 import fractions
@@ -54,7 +54,7 @@ NO_NUMBER = {
 
 
 @pytest.mark.parametrize("observation", NOT_NUMBERS.values(), ids=NOT_NUMBERS)
-def test_an_observation_that_is_no_array_of_numbers_is_one_clear_error(observation):
+def test_an_observation_that_is_not_an_array_of_numbers_is_one_clear_error(observation):
     at_reset = CheckedEnv(Corridor(observe=lambda position, t: observation))
     wanted = r"^env Corridor: the observation must be an array of numbers, got .* in episode 3, "
     with pytest.raises(ValueError, match=wanted + "at the reset$"):
@@ -66,7 +66,7 @@ def test_an_observation_that_is_no_array_of_numbers_is_one_clear_error(observati
 
 
 @pytest.mark.parametrize("reward", NO_NUMBER.values(), ids=NO_NUMBER)
-def test_a_reward_that_is_no_number_is_one_clear_error(reward):
+def test_a_reward_that_is_not_a_number_is_one_clear_error(reward):
     env = CheckedEnv(Corridor(reward=lambda t: reward))
     env.reset(0, episode=3)
     with pytest.raises(ValueError, match=r"^env Corridor: the reward must be a number, got .* in episode 3, step 0$"):
@@ -136,16 +136,16 @@ BOX = spaces.Box(-np.inf, np.inf, (2,))
 FEW = Config(num_episodes=3, batch_size=16)
 
 
-def told(env, config=FEW, **parts):
-    """The warnings of a short run."""
+def warnings_in(env, config=FEW, **parts):
+    """Returns the warnings of a short run."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         train(env, config, seed=0, verbose=0, **parts)
     return [str(x.message) for x in caught if x.category is UserWarning]
 
 
-def told_of(states, space, is_default_network=False):
-    """The warnings of a watch of a run through these states."""
+def warnings_about(states, space, is_default_network=False):
+    """Returns the warnings of a Watch that sees these states."""
     watch, memory = Watch("name", space, is_default_network), ReplayMemory(len(states) - 1, space.shape)
     for state, next_state in itertools.pairwise(states):
         memory.append(Experience(state, 0, 0.0, next_state, False))
@@ -158,7 +158,7 @@ def told_of(states, space, is_default_network=False):
 
 
 def moving(second, space=BOX, limit=50):
-    """An environment whose feature 1 is `second(t)`, where t counts all steps."""
+    """Returns an environment whose feature 1 is `second(t)`, where t counts all steps."""
     env = Corridor(length=10**6, limit=limit, observation_space=space)
     env.num_seen = 0
 
@@ -175,7 +175,7 @@ def own_network(scale=1.0):
 
 
 class Functional(CartPole):
-    """CartPole, whose feature 1 is multiplied."""
+    """CartPole with feature 1 multiplied by a factor."""
 
     def __init__(self, factor, observation_space=None):
         super().__init__()
@@ -187,7 +187,7 @@ class Functional(CartPole):
 
 
 def test_an_observation_far_outside_its_space_is_one_warning():
-    (message,) = told(moving(lambda t: 42.0 + (t == 60), spaces.Box(0, np.array([5, 3.0]), dtype=np.float64)))
+    (message,) = warnings_in(moving(lambda t: 42.0 + (t == 60), spaces.Box(0, np.array([5, 3.0]), dtype=np.float64)))
     assert message.startswith("env Corridor: feature 1 was 43 in an observation, far outside the bounds 0 and 3 of env")
 
 
@@ -210,7 +210,7 @@ def test_an_observation_far_outside_its_space_is_one_warning():
 def test_far_is_ten_times_the_distance_between_the_bounds(low, high, value, is_far):
     space = spaces.Box(np.array([-1, low]), np.array([1, high]), dtype=np.float64)
     inside = np.array([0.0, np.clip(0, low, high)])
-    messages = told_of([inside, np.array([0, value]), inside], space)
+    messages = warnings_about([inside, np.array([0, value]), inside], space)
     assert [("feature 1 was" in message) for message in messages] == [True] * is_far
 
 
@@ -236,7 +236,7 @@ def test_gymnasiums_environments_give_no_warning(name):
                 state, _, terminated, truncated, _ = env.step(choose())
                 is_over = terminated or truncated
             states.append(state)
-        assert not told_of(states, env.observation_space, is_default_network=True)
+        assert not warnings_about(states, env.observation_space, is_default_network=True)
 
 
 def test_a_lander_that_flies_away_gives_no_warning():
@@ -250,7 +250,7 @@ def test_a_lander_that_flies_away_gives_no_warning():
             is_over = terminated or truncated
             states.append(state)
         highest = max(highest, *(state[1] for state in states))
-        assert not told_of(states, env.observation_space, is_default_network=True)
+        assert not warnings_about(states, env.observation_space, is_default_network=True)
     assert highest > 10  # the bound is 2.5
 
 
@@ -276,7 +276,7 @@ ROUNDED = {
 
 @pytest.mark.parametrize(("second", "is_lost"), ROUNDED.values(), ids=ROUNDED)
 def test_changes_that_float32_loses_are_one_warning(second, is_lost):
-    messages = told_of([np.array([t % 50, second(t)]) for t in range(1_000)], BOX)
+    messages = warnings_about([np.array([t % 50, second(t)]) for t in range(1_000)], BOX)
     assert len(messages) == is_lost
     for message in messages:
         assert message.startswith("env name: feature 1 of the observations changes in steps that are lost in float32")
@@ -284,7 +284,7 @@ def test_changes_that_float32_loses_are_one_warning(second, is_lost):
 
 
 def test_a_run_on_a_clock_is_one_warning():
-    (message,) = told(moving(lambda t: 1.7e9 + t), q_network=own_network(0.0))
+    (message,) = warnings_in(moving(lambda t: 1.7e9 + t), q_network=own_network(0.0))
     assert message.startswith("env Corridor: feature 1 of the observations changes in steps that are lost in float32")
 
 
@@ -296,18 +296,22 @@ def test_numbers_that_float32_holds_exactly_are_not_collected(dtype):
 
 
 def test_unscaled_observations_in_the_default_network_are_one_warning():
-    (message,) = told(moving(lambda t: 101.0))
+    (message,) = warnings_in(moving(lambda t: 101.0))
     assert message.startswith("env Corridor: observations are beyond 100 in size (feature 1), but the default network")
     assert "keras.layers.Rescaling" in message
-    assert not told(moving(lambda t: 99.0))
-    assert not told(moving(lambda t: 101.0), q_network=own_network())
+    assert not warnings_in(moving(lambda t: 99.0))
+    assert not warnings_in(moving(lambda t: 101.0), q_network=own_network())
 
 
 def test_uint8_observations_in_the_default_network_are_one_warning():
     space = spaces.Box(0, 255, (5,), np.uint8)
-    (message,) = told(Corridor(limit=50, observation_space=space, observe=lambda position, t: np.full(5, t, np.uint8)))
+    (message,) = warnings_in(
+        Corridor(limit=50, observation_space=space, observe=lambda position, t: np.full(5, t, np.uint8))
+    )
     assert message.startswith("env Corridor: observations are uint8 (feature 0, feature 1, feature 2, ...), but the")
-    assert not told(Corridor(limit=50, observation_space=space, observe=lambda p, t: np.full(5, t % 2, np.uint8)))
+    assert not warnings_in(
+        Corridor(limit=50, observation_space=space, observe=lambda p, t: np.full(5, t % 2, np.uint8))
+    )
 
 
 @pytest.mark.slow
@@ -327,7 +331,7 @@ def test_a_run_that_diverges_before_that_is_warned_first():
 
 
 class Masked(Corridor):
-    """Says which actions are allowed, at the reset or at the steps."""
+    """Returns an action mask, at the reset or at the steps."""
 
     def __init__(self, at_reset):
         super().__init__(limit=50)
@@ -344,7 +348,7 @@ class Masked(Corridor):
 
 @pytest.mark.parametrize("at_reset", [True, False])
 def test_an_action_mask_is_one_warning_that_it_is_ignored(at_reset):
-    (message,) = told(Masked(at_reset))
+    (message,) = warnings_in(Masked(at_reset))
     assert message == "env Masked: info['action_mask'] is ignored: any action may be taken in any state"
 
 
@@ -379,7 +383,7 @@ def test_the_warnings_point_at_the_line_that_calls_train_or_study():
 
 
 class Mission(gym.Space):
-    """A space that Gymnasium does not know, as MiniGrid's."""
+    """A space that Gymnasium does not know, such as MiniGrid's."""
 
     def __init__(self):
         super().__init__((), str)
@@ -443,7 +447,7 @@ def test_the_wrapper_that_is_named_for_a_space_works(space, way):
         assert "a gymnasium.ObservationWrapper of your own can" in str(caught.value)
         assert "FlattenObservation" not in str(caught.value)
         return
-    assert f"({way} makes one of " in str(caught.value)
+    assert f"(use {way}" in str(caught.value)
     wrapped = CheckedEnv(eval(way, {"gymnasium": gym, "env": env}))
     assert wrapped.reset(0, 0).shape == wrapped.spaces.state_shape
 
@@ -457,29 +461,29 @@ def test_the_command_line_flattens_what_can_be_flattened_and_says_what_cannot(na
     if is_possible:
         assert len(flat.make().observation_space.shape) == 1
     else:
-        with pytest.raises(ValueError, match=r"^Grid-v0 has the observation space .*; (gymnasium\.|no wrapper)"):
+        with pytest.raises(ValueError, match=r"^Grid-v0 has the observation space .*; (use gymnasium\.|no wrapper)"):
             flat.make()
     if not isinstance(space, spaces.Box):
-        hint = "--flatten makes one axis of it$" if is_possible else r"(gymnasium\.|no wrapper)"
+        hint = "use --flatten$" if is_possible else r"(use gymnasium\.|no wrapper)"
         with pytest.raises(ValueError, match=rf"^Grid-v0 has the observation space .*; {hint}"):
             plain.make()
 
 
 NO_ENVS = {
-    "a name": ("CartPole-v1", r"'CartPole-v1'; gymnasium\.make\(\"CartPole-v1\"\) makes one$"),
-    "a spec": (gym.spec("CartPole-v1"), r"the EnvSpec of CartPole-v1; gymnasium\.make\(spec\) makes one$"),
-    "a class": (Corridor, r"the class Corridor; Corridor\(\) makes one$"),
-    "a functional class": (CartPole, r"the class CartPole; CartPole\(\) makes one$"),
+    "a name": ("CartPole-v1", r"'CartPole-v1'; use gymnasium\.make\(\"CartPole-v1\"\)$"),
+    "a spec": (gym.spec("CartPole-v1"), r"the EnvSpec of CartPole-v1; use gymnasium\.make\(spec\)$"),
+    "a class": (Corridor, r"the class Corridor; use Corridor\(\)$"),
+    "a functional class": (CartPole, r"the class CartPole; use CartPole\(\)$"),
     "a vector environment": (
         gym.make_vec("CartPole-v1", 2),
-        r"the vector environment .*; one environment is played at a time, as gymnasium\.make makes it$",
+        r"the vector environment .*; use gymnasium\.make: only one environment is played at a time$",
     ),
     "nothing": (None, "None$"),
 }
 
 
 @pytest.mark.parametrize(("thing", "hint"), NO_ENVS.values(), ids=NO_ENVS)
-def test_what_is_no_environment_is_told_with_how_to_make_one(thing, hint):
+def test_what_is_not_an_environment_is_an_error_that_says_how_to_make_one(thing, hint):
     with pytest.raises(TypeError, match=r"^env must be a gymnasium\.Env or a FuncEnv, got " + hint):
         train(thing)
     with pytest.raises(TypeError, match=r"^env must be a gymnasium\.Env, got " + hint):

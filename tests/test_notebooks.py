@@ -35,7 +35,7 @@ def test_every_notebook_has_its_script():
 
 
 @pytest.mark.parametrize("path", CONVERTED, ids=lambda path: path.stem)
-def test_the_rendered_notebook_is_of_its_script(path):
+def test_the_rendered_notebook_has_the_cells_of_its_script(path):
     assert inputs(nbformat.read(path, 4)) == inputs(CONVERTED[path]), f"run: make notebook ({path.name} is stale)"
 
 

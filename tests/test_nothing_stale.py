@@ -1,4 +1,4 @@
-"""What runs is what is there at the call: a change since the last one is seen, and what is equal compiles once."""
+"""A change between two calls is always seen, and equal parts compile only once."""
 
 import functools
 import gc
@@ -71,7 +71,7 @@ LOSS_CHANGES = {
 @pytest.mark.slow
 @BOTH_LOOPS
 @pytest.mark.parametrize("change", LOSS_CHANGES)
-def test_train_sees_what_the_loss_reads(make_env, change, monkeypatch):
+def test_train_sees_a_change_in_what_the_loss_reads(make_env, change, monkeypatch):
     loss, apply = LOSS_CHANGES[change]
     before = trained(make_env, optimizer=sgd(), loss=loss)
     np.testing.assert_array_equal(before, trained(make_env, optimizer=sgd(), loss=loss))
@@ -80,7 +80,7 @@ def test_train_sees_what_the_loss_reads(make_env, change, monkeypatch):
 
 
 @pytest.mark.parametrize("change", LOSS_CHANGES)
-def test_learn_sees_what_the_loss_reads(change, monkeypatch, random_batch):
+def test_learn_sees_a_change_in_what_the_loss_reads(change, monkeypatch, random_batch):
     loss, apply = LOSS_CHANGES[change]
     networks, optimizer, batch = fresh(), sgd(), random_batch(8)
     learn(batch, 0.9, *networks, optimizer, loss=loss)
@@ -279,7 +279,7 @@ def test_runs_with_an_equal_loss_compile_once_and_leave_no_memory_behind(make_en
     for _ in range(6):
         after = run()
     assert len(_compiled) == num_compiled
-    assert after - before < 6 * 3  # MB; a program of its own takes about 40 in the compiled loop
+    assert after - before < 6 * 3  # MB; a further program of the compiled loop takes about 40
 
 
 def test_new_functions_at_each_call_of_learn_are_warned_of(random_batch):
@@ -297,7 +297,7 @@ def test_new_functions_at_each_call_of_learn_are_warned_of(random_batch):
 def test_transitions_are_counted_beyond_32_bits():
     spaces = check_spaces("CartPole", CartPole.observation_space, CartPole.action_space)
     prints = []
-    for num_before in (50_000, 50_000 * 50_000):  # a full memory, at the same place of its ring
+    for num_before in (50_000, 50_000 * 50_000):  # a full memory, at the same index of its ring
         agent = make_agent((4,), 2, QUICK, 0)
         agent.memory.rows[:] = np.random.default_rng(0).normal(size=agent.memory.rows.shape)
         agent.memory.rows[:, 8] = agent.memory.rows[:, 10] = 0

@@ -1,4 +1,4 @@
-"""A reader's own environment, network and loss."""
+"""The user's own environment, network and loss."""
 
 import random
 
@@ -19,7 +19,7 @@ QUICK = Config(num_episodes=6, batch_size=16, max_steps=40, solved_reward=1e6)
 
 
 class Beacon(gym.Env):
-    """One lit pixel of three says which of three actions gives 1; an episode is ten such pictures."""
+    """Shows which of three actions gives 1 by one lit pixel of three; an episode is ten such pictures."""
 
     observation_space = gym.spaces.Box(0, 255, (6, 6, 1), np.uint8)
     action_space = gym.spaces.Discrete(3)
@@ -58,7 +58,7 @@ def glorot(seed):
 
 
 def tanh_network(num_features=4, num_actions=2):
-    """Functional, and not one that NumPy computes."""
+    """Returns a functional model, which acting in NumPy cannot compute."""
     inputs = keras.Input((num_features,))
     hidden = keras.layers.Dense(16, activation="tanh", kernel_initializer=glorot(1))(inputs)
     both = keras.layers.Concatenate()([hidden, inputs])
@@ -93,19 +93,19 @@ def test_gymnasiums_environments_train(make_env):
 
 @pytest.mark.slow
 def test_frozen_lake_is_solved():
-    # No chance in its moves: the way over the ice gives 1, every time; over three seeds, so that it is no luck.
+    # Without slipping, the way over the ice gives 1 every time; three seeds show that it is not luck.
     config = Config(num_episodes=600, gamma=0.9, epsilon_min=0.01, decay=0.99, solved_reward=0.9, tau=0.05)
     for seed in range(3):
         env = FlattenObservation(gym.make("FrozenLake-v1", is_slippery=False))
         assert train(env, config, seed=seed, verbose=0).solved_at is not None
 
 
-def test_discrete_observations_are_refused_with_what_to_do():
+def test_discrete_observations_are_an_error_that_says_what_to_do():
     with pytest.raises(ValueError, match=r"env FrozenLake-v1 has .* Discrete\(16\); .*FlattenObservation\(env\)"):
         train(gym.make("FrozenLake-v1"))
 
 
-def test_a_time_limit_of_the_readers_own_truncates():
+def test_an_own_time_limit_truncates():
     run = train(TimeLimit(Corridor(length=50), 7), Config(num_episodes=4, batch_size=4), seed=0, verbose=0)
     assert [e.steps for e in run.episodes] == [7] * 4
     assert not any(e.terminated for e in run.episodes)
@@ -116,7 +116,7 @@ def test_a_time_limit_of_the_readers_own_truncates():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make_env", [lambda: gym.make("CartPole-v1"), CartPole], ids=["Gymnasium", "compiled"])
-def test_a_network_of_the_readers_own_is_trained_in_place(make_env):
+def test_an_own_network_is_trained_in_place(make_env):
     network = tanh_network()
     before = network.get_weights()
     seen = []
@@ -130,7 +130,7 @@ def test_a_network_of_the_readers_own_is_trained_in_place(make_env):
     np.testing.assert_array_equal(weights(run), weights(again))
 
 
-def test_q_hat_starts_as_an_equal_copy_that_does_not_follow_of_itself():
+def test_q_hat_starts_as_an_equal_copy_that_does_not_follow_q():
     config = Config(num_episodes=3, max_steps=4, batch_size=2, tau=1e-9)
     run = train(gym.make("CartPole-v1"), config, seed=0, q_network=tanh_network(), verbose=0)
     for start, hat, q in zip(
@@ -148,7 +148,7 @@ def test_the_default_network_given_from_outside_is_the_default_run(cartpole):
 
 
 def test_a_network_that_numpy_cannot_compute_learns_the_same_as_one_that_it_can(cartpole):
-    """The same function, once as Dense(relu) and once as Dense and a ReLU layer: two ways of acting, one result."""
+    """Compares Dense(relu), which acts in NumPy, with Dense and a ReLU layer, which act in TensorFlow."""
     q_network = keras.Sequential([keras.Input((4,)), keras.layers.Dense(64, "relu"), keras.layers.Dense(2)])
     apart = keras.Sequential(
         [keras.Input((4,)), keras.layers.Dense(64), keras.layers.ReLU(), keras.layers.Dense(2, name="values")]
@@ -172,7 +172,7 @@ def test_a_convolutional_network_learns_from_images():
 
 
 class FunctionalBeacon(FuncEnv):
-    """The same, in TensorFlow."""
+    """The same environment, in TensorFlow."""
 
     observation_space, action_space, max_episode_steps = Beacon.observation_space, Beacon.action_space, 10
 
@@ -206,11 +206,11 @@ def test_images_of_a_functional_environment_are_learned_from_in_compiled_episode
 
 
 @pytest.mark.slow
-def test_a_run_with_a_network_of_the_readers_own_is_saved_and_gone_on_from(tmp_path):
+def test_a_run_with_an_own_network_is_saved_and_resumed(tmp_path):
     whole = train(Beacon(), QUICK, seed=0, q_network=convolutional(), verbose=0)
     part = Config(**{**vars(QUICK), "num_episodes": 3})
     train(Beacon(), part, seed=0, q_network=convolutional(), checkpoint=tmp_path / "run", verbose=0)
-    # Made later, its layers have other names.
+    # The layers of a network that is made later have other names.
     run = train(Beacon(), QUICK, seed=0, q_network=convolutional(), checkpoint=tmp_path / "run", resume=True, verbose=0)
     np.testing.assert_array_equal(weights(run), weights(whole))
     np.testing.assert_array_equal(run.agent.memory.rows, whole.agent.memory.rows)
@@ -224,7 +224,7 @@ def test_a_run_with_a_network_of_the_readers_own_is_saved_and_gone_on_from(tmp_p
 
 
 def dueling():
-    """A layer's values plus what is above their mean: with an operation that is no layer."""
+    """Returns a dueling network, with an operation that is not a layer."""
     inputs = keras.Input((4,))
     hidden = keras.layers.Dense(8, activation="relu", kernel_initializer=glorot(1))(inputs)
     value, advantage = (keras.layers.Dense(n, kernel_initializer=glorot(n))(hidden) for n in (1, 2))
@@ -252,7 +252,7 @@ def test_networks_that_differ_are_told_apart_whatever_they_are_called(cartpole, 
 
 
 @pytest.mark.slow
-def test_a_layer_that_is_defined_anew_is_run_anew(cartpole):
+def test_a_layer_that_is_defined_again_is_traced_again(cartpole):
     def train_with(function):
         class Bend(keras.layers.Layer):
             def call(self, inputs):
@@ -278,9 +278,7 @@ def test_a_network_of_an_unregistered_class_is_refused_when_it_is_saved(cartpole
 
     network = keras.Sequential([keras.Input((4,)), Unregistered(), keras.layers.Dense(2)])
     run = train(cartpole, QUICK, seed=0, q_network=network, verbose=0)
-    with pytest.raises(
-        ValueError, match=r"^q_network has a layer that no file can name: .*register_keras_serializable"
-    ):
+    with pytest.raises(ValueError, match=r"^q_network has a layer that cannot be saved: .*register_keras_serializable"):
         run.save(tmp_path / "agent.keras")
 
 
@@ -326,7 +324,7 @@ def test_a_network_that_does_not_fit_is_refused(cartpole, network, error, messag
         train(cartpole, q_network=network())
 
 
-def test_an_observation_that_is_not_uint8_as_promised_is_told():
+def test_an_observation_that_is_not_uint8_as_promised_is_an_error():
     class Wrong(Beacon):
         def step(self, action):
             picture, *others = super().step(action)

@@ -44,7 +44,7 @@ def test_the_curve_of_a_short_run_has_no_mean():
     assert len(plot_rewards([1.0, 2.0]).get_lines()) == 1
 
 
-def test_the_curve_goes_where_it_is_told():
+def test_the_curve_is_drawn_in_the_given_axes():
     _, ax = plt.subplots()
     assert plot_rewards([1.0], ax) is ax
 
@@ -71,7 +71,7 @@ def test_recording_without_frames_says_how_to_get_them(cartpole):
 
 @pytest.fixture
 def frames():
-    """A white square that moves over black, 9 frames."""
+    """Returns nine frames of a white square that moves over black."""
     pictures = np.zeros((9, 40, 60, 3), np.uint8)
     for k, picture in enumerate(pictures):
         picture[10:20, 5 * k : 5 * k + 10] = 255
@@ -134,7 +134,7 @@ def test_a_run_at_a_glance_shows_its_history(cartpole, speed):
 
 
 def _linear_q_network():
-    """Q(s, 0) = s[1], Q(s, 1) = 2 s[3]."""
+    """Returns a network with Q(s, 0) = s[1] and Q(s, 1) = 2 s[3]."""
     network = make_q_network(4, 2, hidden_units=(8,), seed=0)
     first, second = np.zeros((4, 8)), np.zeros((8, 2))
     for entry, unit, sign in ((1, 0, 1), (1, 1, -1), (3, 2, 1), (3, 3, -1)):  # x = relu(x) - relu(-x)
@@ -181,7 +181,7 @@ def test_the_other_entries_of_the_state_stay_as_they_are():
         ({"x": (0, 1, 1)}, r"^x must have its lowest value before its highest"),
         ({"y": (0, 0, 1)}, r"^x and y must be different entries of the state, got 0 for both"),
         ({"y": (1, 0)}, r"^y must be an index, a lowest and a highest value"),
-        ({"state": [0.0]}, r"^state must have 4 entries, as q_network takes them, got 1"),
+        ({"state": [0.0]}, r"^state must have 4 entries, the input size of q_network, got 1"),
         ({"limits": (2, 1)}, r"^limits must be two Q-values, the lower first"),
     ],
 )

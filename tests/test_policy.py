@@ -6,7 +6,7 @@ from dqn_keras import Config, action, decay_epsilon
 
 
 class Tape(np.random.Generator):
-    """A generator that gives what it is told, and writes down what it was asked."""
+    """A random generator that returns given numbers and records the calls."""
 
     def __init__(self, uniform, integer):
         super().__init__(np.random.PCG64())
@@ -22,7 +22,7 @@ class Tape(np.random.Generator):
 
 
 @pytest.mark.parametrize("q", [np.array([1.0, 5.0, 2.0]), np.array([[1.0, 5.0, 2.0]])])
-def test_explores_below_epsilon_and_is_greedy_from_it_on(q):
+def test_action_explores_below_epsilon_and_is_greedy_from_there_on(q):
     explore, greedy = Tape(0.29, 2), Tape(0.3, 2)
     assert action(q, 0.3, explore) == 2
     assert explore.calls == ["random()", "integers(3)"]
@@ -31,7 +31,7 @@ def test_explores_below_epsilon_and_is_greedy_from_it_on(q):
 
 
 def test_values_of_many_states_are_refused_and_tensors_are_taken(rng):
-    with pytest.raises(ValueError, match="those of one state"):
+    with pytest.raises(ValueError, match="the values of one state"):
         action(np.zeros((10, 2)), 0.0, rng)
     assert action(tf.constant([[1.0, 3.0]]), 0.0, rng) == 1
 

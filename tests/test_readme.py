@@ -26,7 +26,7 @@ def without_numbers(text):
     return re.sub(r"\d+(\.\d+)?", "#", text)  # those of another machine may differ
 
 
-def test_the_readmes_commands_are_ones():
+def test_the_readmes_commands_exist():
     commands = re.findall(r"^dqn-keras (.*)$", README, re.MULTILINE)
     assert len(commands) == 3
     for command in commands:

@@ -15,7 +15,7 @@ from dqn_keras.replay import unpack
 
 
 class MemoryAgainstDeque(RuleBasedStateMachine):
-    """Whatever is appended and drawn, the ring holds what a bounded deque holds, in its order."""
+    """After any appends and draws, the ring holds the same as a bounded deque, in the same order."""
 
     @initialize(size=st.integers(1, 12), features=st.integers(1, 3), seed=st.integers(0, 99))
     def start(self, size, features, seed):

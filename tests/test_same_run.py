@@ -1,4 +1,4 @@
-"""Which parts make it the same run, so that a checkpoint of it can be resumed, and which do not."""
+"""Which changes make a run another run, so that its checkpoint cannot be resumed, and which do not."""
 
 import functools
 import importlib
@@ -26,7 +26,7 @@ def weights_of(run):
     return np.concatenate([w.ravel() for n in (run.q_network, run.q_hat_network) for w in n.get_weights()])
 
 
-def go_on(folder, resume=True, env=None, config=QUICK, **own):
+def run_in(folder, resume=True, env=None, config=QUICK, **own):
     return train(env or gym.make("CartPole-v1"), config, 0, checkpoint=folder, resume=resume, verbose=0, **own)
 
 
@@ -45,7 +45,7 @@ def loss_by_helper(y, q):
     return tf.reduce_mean(helper(y - q))
 
 
-# What a checkpoint knows them by
+# How a checkpoint identifies parts
 
 
 def doubled(scale, y, q):
@@ -56,7 +56,7 @@ def own_targets(experiences, gamma, q_network, q_hat_network):
     return td_targets(experiences, gamma, q_network, q_hat_network)
 
 
-def test_functions_without_a_name_are_refused_for_a_checkpoint(tmp_path, cartpole):
+def test_functions_without_an_importable_name_are_refused_for_a_checkpoint(tmp_path, cartpole):
     def local(y, q):
         return tf.reduce_mean(tf.square(y - q))
 
@@ -110,22 +110,22 @@ SAME_OR_NOT = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("slot", SAME_OR_NOT)
-def test_a_run_is_resumed_with_the_same_parts_and_with_no_others(slot, tmp_path, cartpole):
-    def go_on(part, folder, resume=True):
+def test_a_run_is_resumed_only_with_the_same_parts(slot, tmp_path, cartpole):
+    def run_in(part, folder, resume=True):
         own = part() if slot in ("optimizer", "q_network") else part
         return train(cartpole, QUICK, seed=0, checkpoint=folder, resume=resume, verbose=0, **{slot: own})
 
     choices = SAME_OR_NOT[slot]
     for i, part in enumerate(choices):
-        go_on(part, tmp_path / str(i), resume=False)
-        go_on(part, tmp_path / str(i))
+        run_in(part, tmp_path / str(i), resume=False)
+        run_in(part, tmp_path / str(i))
         with pytest.raises(ValueError, match=rf"^{slot} is "):
-            go_on(choices[i - 1], tmp_path / str(i))
+            run_in(choices[i - 1], tmp_path / str(i))
 
 
 def test_another_source_under_the_same_name_is_noticed(tmp_path, cartpole, monkeypatch):
     module = importlib.import_module(__name__)
-    go_on(tmp_path, resume=False, loss=scaled_loss)
+    run_in(tmp_path, resume=False, loss=scaled_loss)
 
     def scaled_again(y, q):
         return 100.0 * tf.reduce_mean(tf.square(y - q))
@@ -136,7 +136,7 @@ def test_another_source_under_the_same_name_is_noticed(tmp_path, cartpole, monke
         r"^loss is 'tests.test_same_run.scaled_loss' in .*npz, got one of that name that computes something else: "
     )
     with pytest.raises(ValueError, match=message):
-        go_on(tmp_path, loss=scaled_again)
+        run_in(tmp_path, loss=scaled_again)
 
 
 def test_a_compiled_networks_optimizer_is_part_of_what_must_be_the_same(tmp_path):
@@ -145,10 +145,10 @@ def test_a_compiled_networks_optimizer_is_part_of_what_must_be_the_same(tmp_path
         network.compile(optimizer, loss="mse")
         return network
 
-    go_on(tmp_path, resume=False, q_network=compiled(keras.optimizers.SGD(0.1)))
-    go_on(tmp_path, q_network=compiled(keras.optimizers.SGD(0.1)))
+    run_in(tmp_path, resume=False, q_network=compiled(keras.optimizers.SGD(0.1)))
+    run_in(tmp_path, q_network=compiled(keras.optimizers.SGD(0.1)))
     with pytest.raises(ValueError, match=r"^optimizer is .*SGD\(learning_rate=0.1\)' .*SGD\(.*clipnorm=0.001"):
-        go_on(tmp_path, q_network=compiled(keras.optimizers.SGD(0.5, clipnorm=1e-3)))
+        run_in(tmp_path, q_network=compiled(keras.optimizers.SGD(0.5, clipnorm=1e-3)))
 
 
 class OwnLoss(keras.losses.Loss):
@@ -165,7 +165,7 @@ class Two:
 
 
 class Held(keras.losses.Loss):
-    """Holds a loss, in a container of any kind."""
+    """Holds a loss in a container of any kind."""
 
     def __init__(self, *held, **by_name):
         super().__init__()
@@ -186,7 +186,7 @@ class Decay(keras.optimizers.schedules.LearningRateSchedule):
 
 
 class Penalty(keras.regularizers.Regularizer):
-    """Its configuration says nothing."""
+    """Has an empty configuration."""
 
     def __init__(self, factor):
         self.factor = factor
@@ -199,7 +199,7 @@ class Penalty(keras.regularizers.Regularizer):
 
 
 class Paying(CartPole):
-    """Its reward is what an object pays that it holds."""
+    """Gives the reward of an object that it holds."""
 
     def __init__(self, held=None):
         super().__init__()
@@ -258,13 +258,13 @@ NESTED = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", NESTED)
-def test_parts_are_known_by_all_that_they_hold(part, tmp_path):
+def test_parts_differ_if_anything_that_they_hold_differs(part, tmp_path):
     make = NESTED[part]
     (name,) = make(0)
-    go_on(tmp_path, resume=False, **make(0))
-    go_on(tmp_path, **make(0))
+    run_in(tmp_path, resume=False, **make(0))
+    run_in(tmp_path, **make(0))
     with pytest.raises(ValueError, match=rf"^{name} is "):
-        go_on(tmp_path, **make(1))
+        run_in(tmp_path, **make(1))
 
 
 CHANGED = {
@@ -277,31 +277,31 @@ CHANGED = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("changed", CHANGED)
-def test_functions_are_known_by_all_that_they_read(changed, tmp_path, monkeypatch):
+def test_functions_differ_if_anything_that_they_read_differs(changed, tmp_path, monkeypatch):
     loss, name, value = CHANGED[changed]
-    go_on(tmp_path, resume=False, loss=loss)
-    go_on(tmp_path, loss=loss)
+    run_in(tmp_path, resume=False, loss=loss)
+    run_in(tmp_path, loss=loss)
     monkeypatch.setattr(importlib.import_module(__name__), name, value)
     with pytest.raises(
         ValueError, match=rf"^loss is 'tests.test_same_run.{loss.__name__}' .* computes something else: "
     ):
-        go_on(tmp_path, loss=loss)
+        run_in(tmp_path, loss=loss)
 
 
 def test_another_gravity_of_the_packages_cartpole_is_another_run(tmp_path, monkeypatch):
-    go_on(tmp_path, resume=False, env=CartPole())
+    run_in(tmp_path, resume=False, env=CartPole())
     monkeypatch.setattr(cartpole_module, "GRAVITY", np.float32(20.0))
     with pytest.raises(ValueError, match=r"^env is .* computes something else: "):
-        go_on(tmp_path, env=CartPole())
+        run_in(tmp_path, env=CartPole())
 
 
-def test_a_method_is_known_by_its_name(tmp_path):
+def test_a_method_is_identified_by_its_name(tmp_path):
     class_ = Two()
-    go_on(tmp_path, resume=False, loss=class_.first)
+    run_in(tmp_path, resume=False, loss=class_.first)
     with pytest.raises(
         ValueError, match=r"^loss is 'tests.test_same_run.Two.first' .*, got 'tests.test_same_run.Two.second'"
     ):
-        go_on(tmp_path, loss=class_.second)
+        run_in(tmp_path, loss=class_.second)
 
 
 def test_a_wrapped_name_of_the_packages_does_not_hide_a_function(tmp_path, monkeypatch):
@@ -313,23 +313,23 @@ def test_a_wrapped_name_of_the_packages_does_not_hide_a_function(tmp_path, monke
 
     wrapped.__module__, wrapped.__qualname__ = __name__, "own_targets"
     monkeypatch.setattr(module, "own_targets", wrapped)
-    go_on(tmp_path, resume=False, targets=wrapped)
+    run_in(tmp_path, resume=False, targets=wrapped)
     monkeypatch.setattr(module, "FACTOR", 2.0)
     with pytest.raises(ValueError, match=r"^targets is .* computes something else: "):
-        go_on(tmp_path, targets=wrapped)
+        run_in(tmp_path, targets=wrapped)
 
 
 def test_what_was_saved_by_another_version_is_compared_by_its_source(tmp_path, monkeypatch):
-    go_on(tmp_path, resume=False, loss=scaled_loss)
+    run_in(tmp_path, resume=False, loss=scaled_loss)
     identity = importlib.import_module("dqn_keras.storage.identity")
     versions = {**identity.versions(), "keras": "99.0"}
     monkeypatch.setattr(identity, "versions", lambda: versions)
-    monkeypatch.setattr(importlib.import_module(__name__), "FACTOR", 1.5)  # which the source does not show
+    monkeypatch.setattr(importlib.import_module(__name__), "FACTOR", 1.5)  # the source does not show this change
     with pytest.warns(UserWarning, match="was saved with keras"):
-        go_on(tmp_path, loss=scaled_loss)
+        run_in(tmp_path, loss=scaled_loss)
     monkeypatch.setattr(importlib.import_module("dqn_keras.storage.parts").inspect, "getsource", lambda code: "another")
     with pytest.raises(ValueError, match=r"^loss is .*scaled_loss' in .*, got one of that name with another source$"):
-        go_on(tmp_path, loss=scaled_loss)
+        run_in(tmp_path, loss=scaled_loss)
 
 
 def used_network():
@@ -348,16 +348,16 @@ def test_an_optimizer_that_was_built_or_used_is_the_same_run(tmp_path):
 
     own = {"q_network": NETWORKS["dense"](), "optimizer": keras.optimizers.AdamW(0.01)}
     longer = Config(**{**vars(QUICK), "num_episodes": 9})
-    go_on(tmp_path, resume=False, **own)
-    ours = weights_of(go_on(tmp_path, config=longer, **own))  # the same cell again
+    run_in(tmp_path, resume=False, **own)
+    ours = weights_of(run_in(tmp_path, config=longer, **own))  # the same cell again
     whole = train(gym.make("CartPole-v1"), longer, 0, verbose=0, **built())
     np.testing.assert_array_equal(ours, weights_of(whole))
-    np.testing.assert_array_equal(ours, weights_of(go_on(tmp_path, config=longer, **built())))
+    np.testing.assert_array_equal(ours, weights_of(run_in(tmp_path, config=longer, **built())))
 
     network = used_network()
     network.save(tmp_path / "used.keras")
-    go_on(tmp_path / "used", resume=False, q_network=network)
-    go_on(tmp_path / "used", q_network=keras.saving.load_model(tmp_path / "used.keras"))
+    run_in(tmp_path / "used", resume=False, q_network=network)
+    run_in(tmp_path / "used", q_network=keras.saving.load_model(tmp_path / "used.keras"))
 
 
 MEAN = tf.Variable(0.0)
@@ -369,7 +369,7 @@ def centred(y, q):
 
 
 class Counting(keras.layers.Layer):
-    """Changes a variable that Keras does not know, each time that the network acts or learns."""
+    """Changes a variable that Keras does not know, whenever the network acts or learns."""
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)

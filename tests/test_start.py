@@ -37,7 +37,7 @@ def output(process):
 
 
 def kept(folder):
-    """The contents of the cache, by name; all of them are whole."""
+    """Returns the files of the cache by name, after checking that each is whole."""
     assert not list(folder.glob("*/process-*"))
     contents = {path.name: path.read_bytes() for path in folder.glob("*/*")}
     assert all(name.endswith(hashlib.sha256(content).hexdigest()[:16]) for name, content in contents.items())
@@ -65,7 +65,7 @@ def test_a_file_of_the_cache_that_is_not_whole_is_made_again(tmp_path):
 
 
 @pytest.mark.slow
-def test_processes_that_fill_the_cache_at_once_do_each_other_no_harm(tmp_path):
+def test_processes_that_fill_the_cache_at_once_do_not_harm_each_other(tmp_path):
     assert len({output(process) for process in [start(DQN_KERAS_CACHE=str(tmp_path)) for _ in range(3)]}) == 1
     output(start(DQN_KERAS_CACHE=str(tmp_path)))
     before = kept(tmp_path)

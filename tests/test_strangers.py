@@ -1,4 +1,4 @@
-"""Files from strangers: opening one runs none of their code, and takes neither unbounded memory nor unbounded time."""
+"""Opening a file from a stranger runs none of its code, and takes neither unbounded memory nor unbounded time."""
 
 import hashlib
 import io
@@ -23,7 +23,7 @@ from dqn_keras.storage.networks import save_q_network
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A run whose config.json names a module, evil.py, that lies in the current folder."""
+    """Makes a run whose config.json names evil.py, a module in the current folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [x for x in sys.path if x not in ("", str(tmp_path))])
     monkeypatch.delitem(sys.modules, "evil", raising=False)
@@ -85,10 +85,10 @@ def test_a_folder_imports_no_module_unless_the_user_names_it(folder, capfd):
 
 
 @pytest.mark.parametrize("environment", [{"id": 5}, {"id": None}, {"arguments": [1]}, {"id": ["evil:CartPole-v1"]}])
-def test_an_environment_of_the_wrong_kind_is_told(folder, environment, capfd):
+def test_an_environment_of_the_wrong_kind_is_an_error(folder, environment, capfd):
     change_environment(folder, **environment)
     assert main(COMMANDS[0].split()) == 2
-    assert "config.json is not as `dqn-keras train` writes it" in capfd.readouterr().err
+    assert "config.json is not what `dqn-keras train` writes" in capfd.readouterr().err
 
 
 def signed(body):
@@ -129,12 +129,12 @@ def test_crafted_archives_are_refused(content, message):
 
 
 def outcome(seed, solved_at, digest="ab" * 32, greedy_return=math.nan, seconds=1.0):
-    """A seed's entry in the file of a study."""
+    """Returns a seed's entry for the file of a study."""
     return seed, solved_at, greedy_return, seconds, digest
 
 
 def study_file(path, **changes):
-    """Writes a study of two seeds of 60 episodes, with these changes of its columns and facts."""
+    """Writes a study of two seeds of 60 episodes, with these changes of columns and facts."""
     config = {**vars(Config(num_episodes=60)), "hidden_units": [64]}
     columns = {f"{seed}/rewards": np.ones(60) for seed in (0, 1)} | {f"{seed}/steps": np.full(60, 7) for seed in (0, 1)}
     setting = {"name": "", "config": config, "seeds": [outcome(0, 55), outcome(1, None)]}
@@ -193,7 +193,7 @@ def test_a_crafted_study_file_is_refused(tmp_path, changes):
 
 
 def change_parts(path, **changes):
-    """Replaces parts of a zip file, by functions of their content; a compressed part if `compressed` is a name."""
+    """Replaces parts of a zip file with functions of their content; compresses the part named `compressed`."""
     compressed = changes.pop("compressed", None)
     with zipfile.ZipFile(path) as zipped:
         parts = {name: zipped.read(name) for name in zipped.namelist()}
@@ -273,7 +273,7 @@ def test_a_crafted_network_is_refused(tmp_path, monkeypatch, changes, message):
     assert "evil" not in sys.modules
 
 
-def test_the_hint_how_to_go_on_names_the_module_again():
+def test_the_hint_how_to_continue_names_the_module_again():
     for line in ("train my.module:Catch-v0 --out folder", "resume folder --import my.module"):
         assert how_to_resume(parse(line.split()), "folder") == "dqn-keras resume folder --import my.module"
     assert how_to_resume(parse(["train", "CartPole-v1", "--out", "folder"]), "a b") == "dqn-keras resume 'a b'"

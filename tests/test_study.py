@@ -39,7 +39,7 @@ def same(first, second):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("env", [CartPole(), gym.make("CartPole-v1")], ids=["functional", "Gymnasium"])
-def test_a_seed_is_the_run_of_train_whichever_others_run_with_it_in_whatever_process(env):
+def test_a_seed_is_the_run_of_train_in_any_process_and_with_any_other_seeds(env):
     outcomes = study(env, QUICK, [5, 3, 4, 0], num_workers=2, verbose=0)
     assert outcomes.seeds.tolist() == [5, 3, 4, 0]
     assert len(set(digests(outcomes).values())) == 4
@@ -54,7 +54,7 @@ def test_a_seed_is_the_run_of_train_whichever_others_run_with_it_in_whatever_pro
 
 
 @pytest.mark.slow
-def test_an_environment_that_is_not_registered_goes_to_the_workers_as_it_is():
+def test_an_environment_that_is_not_registered_is_sent_to_the_workers_as_it_is():
     config = Config(num_episodes=60, batch_size=8, solved_reward=3.5)
     outcomes = study(Corridor(length=100, limit=4), config, range(3), num_workers=2, verbose=0)
     assert outcomes.solved_at.tolist() == [49, 49, 49]
@@ -92,7 +92,7 @@ def test_a_change_that_workers_cannot_see_is_refused(monkeypatch):
 
 @pytest.fixture
 def trained(monkeypatch):
-    """The seeds that are trained, in this process."""
+    """Returns a list that records the seeds trained in this process."""
     seeds, train_seed = [], workers._train_seed
 
     def note_and_train(setting, seed):
@@ -103,7 +103,7 @@ def trained(monkeypatch):
     return seeds
 
 
-def test_the_same_study_again_does_only_what_is_missing(tmp_path, trained):
+def test_a_repeated_study_trains_only_the_missing_seeds(tmp_path, trained):
     file = tmp_path / "studies" / "quick.npz"
     first = study(CartPole(), QUICK, range(3), file=file, num_workers=1, verbose=0)
     again = study(CartPole(), QUICK, range(3), file=file, num_workers=1, verbose=0)
@@ -207,7 +207,7 @@ print("kept", len(outcome.seeds), flush=True)
 @pytest.mark.parametrize(
     ("moment", "least", "send"),
     [
-        ("workers started", 0, lambda pid: os.killpg(pid, signal.SIGINT)),  # as a terminal does: to all processes
+        ("workers started", 0, lambda pid: os.killpg(pid, signal.SIGINT)),  # to all processes, as a terminal does
         ("saved 2", 2, lambda pid: os.killpg(pid, signal.SIGINT)),
         ("saved 2", 2, lambda pid: os.kill(pid, signal.SIGTERM)),
     ],
@@ -237,7 +237,7 @@ def test_an_environment_is_copied_as_it_is():
 
 
 @pytest.mark.slow
-def test_an_environment_that_has_rendered_is_made_anew_from_its_spec():
+def test_an_environment_that_has_rendered_is_made_again_from_its_spec():
     env = gym.make("CartPole-v1", render_mode="rgb_array")
     env.reset(seed=0)
     env.render()
@@ -258,7 +258,7 @@ def test_an_error_in_a_worker_is_the_studys_and_the_finished_seeds_are_kept(tmp_
     assert load_study(file).seeds.tolist() == [0, 1]
 
 
-def test_the_bar_is_shown_unless_told_not_to(capfd):
+def test_the_bar_is_shown_unless_verbose_is_0(capfd):
     study(CartPole(), QUICK, [0], num_workers=1)
     assert "1/1" in capfd.readouterr().err
     study(CartPole(), QUICK, [0], num_workers=1, verbose=0)
@@ -294,7 +294,7 @@ def test_without_ray_the_error_names_the_extra(monkeypatch):
 
 
 def kill_a_busy_worker(killed):
-    """Kill the first process that is at a seed."""
+    """Kills the first process that trains a seed."""
     deadline = time.monotonic() + 600
     while not killed and time.monotonic() < deadline:
         for process in psutil.Process().children(recursive=True):
@@ -333,7 +333,7 @@ def test_a_cluster_of_two_nodes_loses_a_worker_and_the_numbers_are_the_same(monk
 
 
 def made_up(*solved_at):
-    """A study of which only the episodes to solved matter."""
+    """Returns a study with these episodes to solved."""
     outcomes = [
         Outcome(k, np.full(k + 60, 10.0 * k), np.full(k + 60, 10), at, np.nan, 1.0, bytes(32))
         for k, at in enumerate(solved_at)

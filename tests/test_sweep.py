@@ -1,4 +1,4 @@
-"""Studies with parts of the user's own, and sweeps of many settings."""
+"""Studies with the user's own parts, and sweeps of many settings."""
 
 import dataclasses
 import warnings
@@ -68,7 +68,7 @@ def test_a_seed_with_own_parts_is_the_run_of_train_with_them(env):
 
 
 @pytest.mark.slow
-def test_a_sweep_is_its_studies_in_whatever_process():
+def test_a_sweep_equals_its_studies_in_any_process():
     found = sweep(CartPole(), SETTINGS, range(3), num_workers=2, verbose=0)
     assert list(found) == list(SETTINGS)
     assert digests(found) == digests(sweep(CartPole(), SETTINGS, range(3), num_workers=1, verbose=0))
@@ -97,7 +97,7 @@ def test_a_sweep_continues_in_its_file_with_more_seeds_and_more_settings(tmp_pat
     loaded = load_sweep(file)
     assert {name: x.config for name, x in loaded.items()} == {name: x.config for name, x in found.items()}
     assert [outcome.seed for outcome in loaded["own"].outcomes] == [0, 1]
-    # a setting that is not asked for stays in the file
+    # a setting that is not part of the call stays in the file
     assert list(sweep(CartPole(), few, [0], **how)) == ["plain", "short"]
     assert list(load_sweep(file)) == list(SETTINGS)
 
@@ -117,14 +117,14 @@ def test_a_sweep_continues_in_its_file_with_more_seeds_and_more_settings(tmp_pat
     ],
     ids=["number", "loss", "optimizer", "network", "evaluation", "environment"],
 )
-def test_a_changed_setting_is_refused_by_name(tmp_path, changed, message):
+def test_a_changed_setting_is_an_error_that_names_it(tmp_path, changed, message):
     how = {"file": tmp_path / "sweep.npz", "num_workers": 1, "verbose": 0}
     sweep(CartPole(), {"own": SETTINGS["own"]}, [0], **how)
     with pytest.raises(ValueError, match=message):
         sweep(CartPole(), {"own": changed}, [0], **how)
 
 
-def test_files_of_studies_and_sweeps_are_told_apart(tmp_path):
+def test_files_of_studies_and_sweeps_are_not_mixed_up(tmp_path):
     how = {"num_workers": 1, "verbose": 0}
     study(CartPole(), QUICK, [0], file=tmp_path / "study.npz", **how)
     sweep(CartPole(), {"a": QUICK}, [0], file=tmp_path / "sweep.npz", **how)
@@ -160,14 +160,14 @@ ONE_NETWORK, ONE_OPTIMIZER = network(0), sgd()
         ({"evaluate_on": MountainCar()}, ValueError, "evaluate_on must be an environment like env CartPole"),
     ],
 )
-def test_wrong_parts_are_refused_by_name_before_any_work(own, error, message):
+def test_wrong_parts_are_an_error_that_names_them_before_any_work(own, error, message):
     with pytest.raises(error, match=f"^{message}"):
         study(CartPole(), QUICK, [0], **own, verbose=0)
     with pytest.raises(error, match=rf"^settings\['x'\]: {message}"):
         sweep(CartPole(), {"plain": QUICK, "x": own}, [0], verbose=0)
 
 
-def test_what_settings_share_is_refused_by_its_own_name():
+def test_a_wrong_shared_argument_is_an_error_that_names_it():
     with pytest.raises(TypeError, match=r"^env must be"):
         sweep("CartPole-v1", {"plain": QUICK}, [0], verbose=0)
     with pytest.raises(ValueError, match=r"^evaluate_on must be an environment like env CartPole"):
@@ -188,13 +188,13 @@ def test_what_settings_share_is_refused_by_its_own_name():
         ({"x": {"config": {}}}, TypeError, r"settings\['x'\]: config must be a Config"),
     ],
 )
-def test_settings_that_are_none_are_refused(settings, error, message):
+def test_what_is_not_settings_is_refused(settings, error, message):
     with pytest.raises(error, match=f"^{message}"):
         sweep(CartPole(), settings, [0], verbose=0)
 
 
 @pytest.mark.parametrize("place", [CartPole(), gym.make("CartPole-v1")], ids=["functional", "Gymnasium"])
-def test_greedy_returns_are_those_of_evaluate_and_are_kept(tmp_path, place):
+def test_greedy_returns_equal_evaluate_and_are_saved(tmp_path, place):
     file = tmp_path / "study.npz"
     found = study(CartPole(), QUICK, [4, 2], evaluate_on=place, file=file, num_workers=1, verbose=0)
     run = train(CartPole(), QUICK, 4, verbose=0)

@@ -12,7 +12,7 @@ from tests.helpers.runs import QUICK, Tape, fingerprint
 
 @pytest.mark.slow
 def test_cartpole_is_solved_in_the_originals_way(cartpole, capsys):
-    # One seed is enough to see every line printed; how often it succeeds is measured over many (results/).
+    # One seed is enough to see every printed line; results/ has the share of many seeds that are solved.
     run = train(cartpole, Config(), seed=0)
     lines = capsys.readouterr().out.splitlines()
     assert run.solved_at is not None
@@ -32,7 +32,7 @@ def test_fewer_episodes_than_the_window_never_count_as_solved():
     assert run.solved_at == 49
 
 
-def test_the_stop_rule_wants_more_not_as_much():
+def test_the_stop_rule_needs_more_than_solved_reward_not_as_much():
     config = Config(num_episodes=60, batch_size=8, solved_reward=4.0, solved_window=50)
     assert train(Corridor(length=100, limit=4), config, seed=0, verbose=0).solved_at is None
 
@@ -44,7 +44,7 @@ def test_one_seed_gives_the_same_bits_in_another_process_and_another_seed_does_n
     assert in_another_process("gym.make('CartPole-v1')", seed=6) != here
 
 
-def test_no_seed_is_a_fresh_one_that_can_be_used_again(cartpole):
+def test_without_a_seed_a_new_one_is_drawn_that_can_be_used_again(cartpole):
     first, second = (train(cartpole, QUICK, verbose=0) for _ in range(2))
     assert first.seed != second.seed
     assert fingerprint(train(cartpole, QUICK, seed=first.seed, verbose=0)) == fingerprint(first)
@@ -73,7 +73,7 @@ def test_an_episode_is_an_epoch_to_keras_callbacks(cartpole):
     assert len(run.episodes) == 2
 
 
-def test_callbacks_hear_every_end_also_when_the_run_is_solved():
+def test_callbacks_see_every_end_also_when_the_run_is_solved():
     tape = Tape()
     config = Config(num_episodes=60, batch_size=8, solved_reward=3.5)
     train(Corridor(length=100, limit=4), config, seed=0, verbose=0, callbacks=[tape])
@@ -141,7 +141,7 @@ def test_bad_arguments_are_refused_before_any_work(cartpole):
         train(cartpole, verbose=3)
 
 
-def test_numpy_seeds_are_taken(cartpole):
+def test_numpy_seeds_are_accepted(cartpole):
     assert train(cartpole, Config(num_episodes=4, batch_size=8), seed=np.int64(3), verbose=0).seed == 3
 
 

@@ -181,7 +181,7 @@ def test_a_thousand_steps_of_the_javascript_are_gymnasiums_and_the_packages(scri
     assert {bool(x) for x in np.abs(next_states[terminated][:, 0]) > 2.4} == {True, False}  # both ends occur
 
 
-def test_the_q_values_of_the_javascript_are_those_of_keras(scripts, gymnasium_steps):
+def test_the_q_values_of_the_javascript_equal_keras(scripts, gymnasium_steps):
     states = gymnasium_steps[0].astype(np.float32)
     for number, snapshot in enumerate(RUN["snapshots"]):
         ours, actions = scripts.evaluate(

@@ -1,8 +1,8 @@
-"""A cache on disk of what XLA has compiled, so that another process need not compile it again.
+"""A cache on disk of the programs that XLA has compiled, so that other processes need not compile them again.
 
 TensorFlow can keep such a cache, but it trusts every file in the folder and writes files in place. So each process gets
-its own folder, with copies of the shared folder's files, which are checked by the SHA-256 in their names. `publish`
-moves new files to the shared folder.
+its own folder, with copies of the files in the shared folder. Before a file is copied, it is checked by the SHA-256 in
+its name. `publish` moves new files to the shared folder.
 
 This module does not import TensorFlow, because TensorFlow reads the setting at its import.
 """
@@ -24,7 +24,7 @@ from dqn_keras._engine.machine import processor
 
 _OPTION = "--tf_xla_persistent_cache_directory="
 _MOST_FILES = 100  # of about 1.5 MB each
-_A_DAY = 24 * 60 * 60  # the folder of a killed process stays that long
+_A_DAY = 24 * 60 * 60  # the folder of a killed process is deleted after this time
 
 
 _own: Path | None = None
@@ -32,9 +32,9 @@ _own: Path | None = None
 
 
 def use_cache(choice: str) -> None:
-    """Lets TensorFlow, not imported yet, keep compiled programs on disk.
+    """Makes TensorFlow, which must not be imported yet, keep compiled programs on disk.
 
-    Does nothing if TF_XLA_FLAGS names a cache of the user's, or if the folder cannot be used.
+    Does nothing if TF_XLA_FLAGS names a cache of the user, or if the folder cannot be used.
 
     Args:
         choice: "1" for the user's cache folder, "0" for no cache, or a folder.
@@ -63,12 +63,12 @@ def use_cache(choice: str) -> None:
                 path.unlink()
     os.environ["TF_XLA_FLAGS"] = f"{flags} {_OPTION}{_own}".strip()
     if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "2") == "2":  # the package's own default, or inherited from a parent
-        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # TensorFlow logs an error for each file that it reads without one
+        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # TensorFlow logs an error even for a file that it reads well
     atexit.register(_leave, _own, os.getpid())
 
 
 def publish() -> None:
-    """Gives the programs that this process has compiled to later processes; of many, the oldest are deleted."""
+    """Makes the programs that this process has compiled available to later processes; deletes the oldest of many."""
     if _own is None:
         return
     with contextlib.suppress(OSError):  # a full disk, or another process has deleted the file
@@ -81,7 +81,7 @@ def publish() -> None:
 
 
 def _leave(own: Path, process: int) -> None:
-    if os.getpid() == process:  # not in a copy of it by fork
+    if os.getpid() == process:  # not in a forked copy
         publish()
         shutil.rmtree(own, ignore_errors=True)
 

@@ -27,8 +27,8 @@ def python_random_kept() -> Iterator[None]:
 def copy(network: keras.Model, states: np.ndarray | None = None) -> keras.Model:
     """Returns a copy of the network that computes the same values and has its own weights.
 
-    Keras copies only what is in a layer's configuration. This function also copies what was set on a layer later, such
-    as the mean that `Normalization.adapt` finds. It then compares the outputs of both networks for `states` [B, *S].
+    Keras copies only the configuration of a layer. This function also copies values that were set on a layer later,
+    such as the mean from `Normalization.adapt`. It then compares the outputs of both networks for `states` [B, *S].
 
     Raises:
         ValueError: a layer cannot be copied, or its copy computes something else; the message names the layer.
@@ -55,7 +55,7 @@ def finalize_layers(network: keras.Model) -> None:
 
 
 def _check_methods(network: keras.Model, second: keras.Model) -> None:
-    """Raises ValueError if the copy lacks a user's own `call`: outputs for a few states may not show this."""
+    """Raises ValueError if the copy lacks a user's own `call`, which the outputs for a few states may not show."""
     layers = [network, *all_layers(network)], [second, *all_layers(second)]
     for layer, copied in zip(*layers, strict=False):
         if type(layer) is not type(copied) or "call" in vars(layer):
@@ -83,7 +83,7 @@ def _check_is_independent(network: keras.Model, second: keras.Model, states: np.
 def _copy_layer(layer: keras.layers.Layer) -> keras.layers.Layer:
     try:
         config = layer.get_config()
-        if type(layer) is keras.layers.Lambda:  # its from_config refuses code that may be from a file
+        if type(layer) is keras.layers.Lambda:  # its from_config rejects code that may be from a file
             names = {key: x for key, x in config.items() if key in ("name", "trainable", "dtype")}
             return keras.layers.Lambda(
                 layer.function, output_shape_of_lambda(layer), layer.mask, layer.arguments, **names
@@ -117,7 +117,7 @@ def _own_names(network: keras.Model) -> dict[str, Any]:
 
 
 def _carry_attributes(layer: keras.layers.Layer, copied: keras.layers.Layer) -> None:
-    """Copies what a configuration does not hold: numbers, arrays and functions that were set on the layer."""
+    """Copies the numbers, arrays and functions that were set on a layer and are not in its configuration."""
     for name, value in vars(layer).items():
         is_plain = value is None or isinstance(value, bool | int | float | str | np.ndarray | np.generic | FunctionType)
         is_variable = isinstance(value, keras.Variable | tf.Variable)  # the copy has its own
@@ -135,17 +135,17 @@ def check_is_equal(problem: str, network: keras.Model, second: keras.Model, stat
         states = np.random.default_rng(0).normal(size=(8, *network.input_shape[1:])).astype(np.float32)
     try:
         outputs, again = network(states), network(states)
-    except tf.errors.OpError:  # the network refuses these states, as an Embedding refuses negative numbers
+    except tf.errors.OpError:  # the network rejects these states, as an Embedding rejects negative numbers
         states = np.zeros_like(states)
         outputs, again = network(states), network(states)
     if not np.array_equal(outputs, again, equal_nan=True):
-        return  # its outputs are random, so that a comparison shows nothing
+        return  # its outputs are random, so a comparison shows nothing
     if np.allclose(outputs, second(states), rtol=1e-4, atol=1e-5, equal_nan=True):
         return
     name, kind = _first_difference(network, second, states)
     raise ValueError(
-        f"{problem}: the copy of layer {name!r} ({kind}) computes something else; its get_config() must hold all that "
-        "it computes with"
+        f"{problem}: the copy of layer {name!r} ({kind}) computes something else; its get_config() must hold every "
+        "value that it computes with"
     )
 
 

@@ -9,10 +9,10 @@ from dqn_keras._engine.tensorflow import tf
 
 
 class Computation(NamedTuple):
-    """What a function computes, in a form that another process can compare."""
+    """The computation of a function, in a form that another process can compare."""
 
     digest: str
-    """Digest, equal for functions that compute the same; empty if the function calls Python, which no graph shows."""
+    """Digest that is equal for functions that compute the same; empty if the graph calls Python code."""
     other_variables: list[tf.Variable]
     """Variables that the function reads or changes, other than those given to `computation`."""
 
@@ -20,7 +20,7 @@ class Computation(NamedTuple):
 def computation(
     function: Callable, specs: Sequence[tf.TensorSpec], variables: Sequence[tf.Variable] = ()
 ) -> Computation:
-    """Returns what `function` computes from tensors as in `specs`; `variables` are those that it may use."""
+    """Returns the computation of `function` for tensors as in `specs`; `variables` are the ones that it may use."""
     concrete = traced(function, specs)
     numbers: dict[int, Any] = {id(handle(x)): (i, tuple(x.shape)) for i, x in enumerate(variables)}
     others = [x for x in concrete.variables if id(x.handle) not in numbers]
@@ -35,7 +35,7 @@ def computation(
 
 
 def fingerprint(concrete: Any) -> str:
-    """Returns a digest of a ConcreteFunction: of its graph, constants and inner functions, without names.
+    """Returns a digest of the graph, constants and inner functions of a ConcreteFunction, without names.
 
     TensorFlow numbers nodes and functions across a process, and Keras numbers layers. The same code traced twice
     therefore gives graphs that differ only in names. Two functions with the same fingerprint compute the same.

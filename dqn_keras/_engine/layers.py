@@ -1,7 +1,7 @@
-"""Layers that XLA compiles into faster code than Keras' own: one side of the matrix is narrow.
+"""Dense layers with few inputs or few outputs that XLA compiles to faster code than Keras' own.
 
-XLA compiles a product with a narrow matrix to a call or to a slow loop of its own. Written as a sum over the few
-columns, it becomes part of the elementwise code around it.
+XLA compiles a product with a narrow matrix to a call or to a slow separate loop. If the product is written as a sum
+over the few columns, it becomes part of the elementwise code around it.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from dqn_keras._engine.tensorflow import keras, tf
 
 
 class FewInputsDense(keras.layers.Dense):
-    """Keras' Dense with another form of the product, for few inputs, such as the features of a small state."""
+    """Computes the same as Keras' Dense, with a product that is fast for few inputs, such as a small state."""
 
     def call(self, inputs: tf.Tensor, training: bool | None = None) -> tf.Tensor:
         x, kernel = tf.convert_to_tensor(inputs), tf.convert_to_tensor(self.kernel)
@@ -28,10 +28,10 @@ def _product_of_few_inputs(x: tf.Tensor, kernel: tf.Tensor) -> tuple[tf.Tensor, 
 
 
 class FewOutputsDense(keras.layers.Dense):
-    """Keras' Dense with another form of the gradient, for few outputs, such as the values of a few actions.
+    """Computes the same as Keras' Dense, with a gradient that is fast for few outputs, such as a few actions.
 
-    TensorFlow's gradient is two products with a transposed matrix, which take a third of a learning step of the 4-64-2
-    network if XLA compiles them.
+    TensorFlow's gradient is two products with a transposed matrix. Compiled by XLA, they take a third of a learning
+    step of the 4-64-2 network.
     """
 
     def call(self, inputs: tf.Tensor, training: bool | None = None) -> tf.Tensor:

@@ -21,7 +21,7 @@ def is_of_a_library(code: FunctionType | type | ModuleType) -> bool:
     if isinstance(code, type) and any(
         isinstance(x, FunctionType) and not is_of_a_library(x) for x in vars(code).values()
     ):
-        return False  # made by exec, so that it has no module
+        return False  # made by exec, without a module
     return name.partition(".")[0] in sys.stdlib_module_names
 
 

@@ -1,4 +1,4 @@
-"""The kind of this machine's processor, on which compiled code and the last bits of results depend."""
+"""The kind of processor, on which compiled code and the last bits of results depend."""
 
 import platform
 import re

@@ -41,7 +41,7 @@ def q_function(q_network: keras.Model) -> Callable[[np.ndarray], np.ndarray]:
 def q_values_now(q_network: keras.Model, state: np.ndarray) -> np.ndarray:
     """Returns Q(s, .) [A] of one state [*S] with the weights that `q_network` has now.
 
-    A call takes about 0.2 ms for a network that NumPy can compute: reading the weights takes most of it. Any other
+    A call takes about 0.2 ms for a network that NumPy can compute, most of it for reading the weights. Any other
     network takes about 0.5 ms in Keras' own compiled function, which the first call makes.
     """
     if is_relu_mlp(q_network):

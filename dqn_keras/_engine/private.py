@@ -12,7 +12,7 @@ from dqn_keras._engine.tensorflow import keras, tf
 
 @functools.cache
 def can_swap_variables() -> bool:
-    """Returns whether a traced function can be called with other variables than those it was traced with.
+    """Returns whether a traced function can be called with other variables than the traced ones.
 
     If not, a program is traced for each agent and called through the public API: slower, with the same results.
     """
@@ -28,7 +28,7 @@ def can_swap_variables() -> bool:
 
 
 def caller(concrete: Any) -> Callable[..., list[tf.Tensor]]:
-    """Returns a ConcreteFunction as a function of its arguments and of everything that it captures.
+    """Returns a ConcreteFunction as a function of its arguments and of all its captured tensors.
 
     A call of the ConcreteFunction itself first binds the arguments to a signature, which takes half as long as a
     learning step. Its `call_flat` reads TensorFlow's options at each call, which takes another fifth.
@@ -43,12 +43,12 @@ def caller(concrete: Any) -> Callable[..., list[tf.Tensor]]:
         run = execute.execute
     except (ImportError, AttributeError):
         return function.call_flat
-    # A function is freed with its last reference, so that the default of `_kept` keeps it.
+    # TensorFlow frees a function with its last reference; `_kept` holds one.
     return lambda *tensors, _kept=function: run(name, num_outputs, list(tensors), options, eager)
 
 
 def tensor_maker() -> Callable[[np.ndarray], tf.Tensor]:
-    """Returns a faster `tf.constant` for arrays that nobody changes: a tensor may share the memory of its array."""
+    """Returns a faster `tf.constant`, for arrays that never change: a tensor may share the memory of its array."""
     try:
         from tensorflow.python.framework.ops import EagerTensor
 
@@ -60,22 +60,22 @@ def tensor_maker() -> Callable[[np.ndarray], tf.Tensor]:
 
 
 def handle(variable: Any) -> tf.Tensor:
-    """Returns the tensor by which a traced function captures a Keras or TensorFlow variable."""
+    """Returns the tensor with which a traced function captures a Keras or TensorFlow variable."""
     return (variable.value if isinstance(variable, keras.Variable) else variable).handle
 
 
 def traced(function: Callable, specs: Sequence[tf.TensorSpec], jit_compile: bool | None = None) -> Any:
     """Traces `function` for tensors as in `specs` to a ConcreteFunction that can be freed completely.
 
-    TensorFlow registers the gradient of every tf.custom_gradient forever, and each one keeps a whole graph alive. They
-    serve to differentiate the function again, which is never done here, so they are removed. Gradients in a
-    tf.function that `function` calls stay: its owner may still need them.
+    TensorFlow registers the gradient of every tf.custom_gradient forever, and each one keeps a whole graph alive. The
+    package needs none of them again, so they are removed. Gradients in a tf.function that `function` calls stay: its
+    owner may still need them.
     """
     try:
         from tensorflow.python.framework.ops import gradient_registry
 
         registry = gradient_registry._registry
-    except (ImportError, AttributeError):  # then the gradients stay registered
+    except (ImportError, AttributeError):  # the gradients then stay registered
         registry = {}
     before = set(registry)
     concrete = tf.function(function, jit_compile=jit_compile, autograph=False).get_concrete_function(*specs)
@@ -106,17 +106,17 @@ _prepared = itertools.count(1)
 
 
 def forget_kernels_now_and_then() -> None:
-    """Frees, at each 32nd call, what TensorFlow keeps of variables that are gone.
+    """Frees, at each 32nd call, the memory that TensorFlow keeps for deleted variables.
 
     TensorFlow keeps a kernel of 0.04 MB for each name that a variable has ever had, and Keras gives each new optimizer
-    another name. The kernels of variables that are still there are made again when they are used.
+    another name. TensorFlow makes the kernels of existing variables again when it needs them.
     """
     if next(_prepared) % 32 == 0:
         try:
             from tensorflow.python.eager import context
 
             context.context().clear_kernel_cache()
-        except (ImportError, AttributeError):  # then they stay
+        except (ImportError, AttributeError):  # the kernels then stay
             pass
 
 
@@ -141,7 +141,7 @@ def walk(network: keras.Model) -> list[keras.layers.Layer]:
 
 
 def is_built_for(optimizer: keras.Optimizer, variables: Sequence[keras.Variable]) -> bool:
-    """Returns whether a built optimizer knows these variables; True if unknown, as Keras raises an error later."""
+    """Returns whether a built optimizer knows these variables; True if unknown, because Keras raises an error later."""
     try:
         optimizer._check_variables_are_known(variables)
     except ValueError:

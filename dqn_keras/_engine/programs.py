@@ -1,9 +1,9 @@
-"""Compiled programs, and which agents can share one: those with the package's own networks and a plain Adam.
+"""Compiled programs, which agents with the package's own networks and a plain Adam share.
 
-TensorFlow traces a function for particular variables, and what XLA compiles from the trace is never freed: a second
-agent would cost seconds of compilation and megabytes of memory. Therefore a program for networks that the package made
-is traced once, on a *stand-in* of the same sizes, and then called with the variables of any agent. A network or
-optimizer of the user is never rebuilt: its program is traced on the objects themselves.
+TensorFlow traces a function for particular variables, and the code that XLA compiles for a trace is never freed: a
+second agent would cost seconds of compilation and megabytes of memory. Therefore a program for networks that the
+package made is traced once, on a *stand-in* of the same sizes, and then called with the variables of any agent. A
+network or optimizer of the user is never rebuilt: its program is traced on the objects themselves.
 """
 
 import contextlib
@@ -52,8 +52,8 @@ class Learner(NamedTuple):
             optimizer.build(q_network.trainable_variables)
         if not is_built_for(optimizer, q_network.trainable_variables):
             raise ValueError(
-                f"optimizer must be a new one, or one that was built for this q_network, got {optimizer.name!r}, which "
-                "was built for other variables"
+                f"optimizer must be new or built for this q_network, got {optimizer.name!r}, which was built for other "
+                "variables"
             )
 
     def sizes(self) -> tuple[int, ...] | None:
@@ -114,12 +114,12 @@ _of_this_study: dict[Hashable, _Program] | None = None
 
 
 _compiled: dict[Hashable, Any] = {}
-"""All traced functions, by fingerprint: what XLA compiled for them stays in memory anyway."""
+"""All traced functions, by fingerprint: the code that XLA compiled for them stays in memory anyway."""
 
 
 @contextlib.contextmanager
 def shared_in(programs: dict) -> Iterator[None]:
-    """Shares programs with the user's parts in `programs` inside the block, for runs that differ only in the seed."""
+    """Shares programs with parts of the user through `programs` in the block, for runs that differ only in the seed."""
     global _of_this_study
     before, _of_this_study = _of_this_study, programs
     try:
@@ -169,7 +169,7 @@ def bind(
     handles = _handles(learner, variables)
     captured = [handles[x] if isinstance(x, int) else x for x in program.captured]
     call = lambda *tensors, _kept=program: program.function(*tensors, *captured)  # noqa: E731
-    return call if sizes is not None else _saying_what_xla_refused(call)
+    return call if sizes is not None else _naming_unsupported_operations(call)
 
 
 def _trace_the_public_way(
@@ -180,10 +180,10 @@ def _trace_the_public_way(
     jit_compile: bool,
 ) -> Callable[..., list[tf.Tensor]]:
     concrete = _traced(make_function(learner, variables), specs, jit_compile)
-    return _saying_what_xla_refused(lambda *tensors: tf.nest.flatten(concrete(*tensors)))
+    return _naming_unsupported_operations(lambda *tensors: tf.nest.flatten(concrete(*tensors)))
 
 
-def _saying_what_xla_refused(call: Callable) -> Callable:
+def _naming_unsupported_operations(call: Callable) -> Callable:
     def checked(*tensors: tf.Tensor) -> list[tf.Tensor]:
         try:
             return call(*tensors)
@@ -221,7 +221,7 @@ def _traced(function: Callable, specs: Sequence, jit_compile: bool) -> Any:
         if "No gradients provided" not in str(error):
             raise
         raise ValueError(
-            "loss must depend on q by operations that TensorFlow can differentiate: q_network gets no gradient"
+            "loss must depend on q through operations that TensorFlow can differentiate: q_network gets no gradient"
         ) from error
 
 

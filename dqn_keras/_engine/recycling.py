@@ -1,4 +1,4 @@
-"""Networks and optimizers of finished runs, kept for the next run with the same sizes: new ones take 25 ms."""
+"""Keeps the networks and optimizers of finished runs for the next run with the same sizes: new ones take 25 ms."""
 
 from collections.abc import Callable
 from typing import Any

@@ -38,14 +38,14 @@ def compiled_step(
 ) -> Callable[..., list[tf.Tensor]]:
     """Returns `make_step(learner)`, compiled for these objects; the compiled step is kept until one of them changes.
 
-    The step takes seven tensors: states, actions, rewards, next_states, terminal_states, gamma and tau. `key` is None
-    for the user's formulas. The step then takes only batches of `batch_size`, so that the shapes that the formulas
-    return can be checked. Otherwise `key` names the package's formulas, and the step takes batches of any size.
+    The step takes seven tensors: states, actions, rewards, next_states, terminal_states, gamma and tau. For the user's
+    formulas, `key` is None and the step takes only batches of `batch_size`, so that the shapes that the formulas return
+    can be checked. Otherwise `key` identifies the package's formulas, and the step takes batches of any size.
     """
     size = batch_size if key is None else None
     parts = (*learner, *formulas, size, jit)
     steps: _Steps = vars(learner.q_network).setdefault("_dqn_keras_steps", _Steps())
-    why = "a part or a batch size that is new"
+    why = "a new part or batch size"
     for step in steps.kept:
         if all(map(_is_the_same, step.parts, parts)):
             if step.watch.is_unchanged():
@@ -63,8 +63,8 @@ def compiled_step(
     steps.num_compiled += 1
     if steps.num_compiled == _MOST_KEPT:
         warnings.warn(
-            f"learn was compiled {_MOST_KEPT} times for {learner.q_network.name!r}, which takes time and memory, the "
-            f"last time for {why}: pass the same objects at each call, and leave them as they are",
+            f"learn was compiled {_MOST_KEPT} times for {learner.q_network.name!r}, the last time because of {why}. "
+            "That takes time and memory: pass the same objects at each call, and do not change them",
             stacklevel=3,
         )
     return call

@@ -46,11 +46,11 @@ def _no_garbage_collection() -> Iterator[None]:
 def _set_up_xla() -> None:
     """Sets how XLA compiles in this process, unless the user has.
 
-    XLA compiles a small loop into one function. Its option, an undocumented one, raises the limit for that from 1 to
-    100 kB, so that compiled episodes are about 1.2 times as fast, with the same bits.
+    XLA compiles a small loop into one function. An undocumented option raises the limit for this from 1 to 100 kB,
+    which makes compiled episodes about 1.2 times as fast, with identical results.
 
-    DQN_KERAS_CACHE is 1 for a cache of compiled programs in the user's cache folder, 0 for none, or a folder for it.
-    Notebooks and the command line have one by default.
+    DQN_KERAS_CACHE is 1 for a cache of compiled programs in the user's cache folder, 0 for no cache, or a folder for
+    the cache. Notebooks and the command line have a cache by default.
     """
     if "xla_backend_extra_options" not in (flags := os.environ.get("XLA_FLAGS", "")):
         option = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000"
@@ -59,7 +59,7 @@ def _set_up_xla() -> None:
 
 
 def require_tensorflow_backend(name: str) -> None:
-    """Raises ImportError, with the remedy, if the backend `name` is not TensorFlow."""
+    """Raises ImportError if the backend `name` is not TensorFlow; the message says what to do."""
     if name != "tensorflow":
         raise ImportError(
             f"dqn_keras needs Keras on TensorFlow, not on {name!r}: "
@@ -77,7 +77,7 @@ with _native_stderr_silenced(), _no_garbage_collection():
     import keras
     import tensorflow as tf
 
-    tf.config.list_physical_devices()  # TensorFlow looks for GPUs once, and logs errors if there is none
+    tf.config.list_physical_devices()  # TensorFlow looks for GPUs once, and logs errors without one
 require_tensorflow_backend(keras.backend.backend())
 
 __all__ = ["keras", "require_xla", "tf"]
@@ -85,20 +85,20 @@ __all__ = ["keras", "require_xla", "tf"]
 
 @functools.cache
 def require_xla() -> None:
-    """Raises RuntimeError, with the remedy, if TensorFlow has no XLA compiler for this machine.
+    """Raises RuntimeError if TensorFlow has no XLA compiler for this machine; the message says what to do.
 
-    If TensorFlow was imported before this package, with all of its log, the lines that its first compilation logs are
-    discarded, so that they are not among what `train` prints.
+    If TensorFlow was imported before this package, its log is not silenced. The lines that its first compilation logs
+    are discarded here, so that they do not mix with the output of `train`.
     """
     try:
         with _native_stderr_silenced():
             _compile_something()
     except tf.errors.OpError as error:
         raise RuntimeError(
-            "XLA cannot compile on this machine; Config(jit_compile=False), or learn(..., jit_compile=False), does "
+            "XLA cannot compile on this machine; Config(jit_compile=False), or learn(..., jit_compile=False), works "
             f"without it in the Gymnasium loop ({error.message.splitlines()[0]})"
         ) from error
 
 
 def _compile_something() -> None:
-    tf.function(tf.nn.relu, jit_compile=True)(tf.constant(0.0))  # logs all that a gradient step would
+    tf.function(tf.nn.relu, jit_compile=True)(tf.constant(0.0))  # logs the same lines as a gradient step

@@ -1,4 +1,4 @@
-"""A watch over the objects that `learn` was compiled for: has one of them changed since?
+"""Finds out whether an object that `learn` was compiled for has changed since.
 
 A trace reads attributes, closures and global names once. `Watch` remembers their values: a comparison takes a few
 microseconds, while a new trace takes a second.
@@ -43,15 +43,15 @@ class _Look(NamedTuple):
 
 
 class Watch:
-    """The state of some objects, as far as a trace can read it.
+    """Remembers the state of some objects, as far as a trace can read it.
 
     The state contains, recursively:
     - the attributes of Keras objects, and of the user's objects and classes, with their methods;
     - the code, the closure and the used global names of the user's functions;
-    - for a bound method, only those attributes of its object that are named in the method or in the methods it calls.
+    - for a bound method, only those attributes of its object that the method, or a method it calls, names.
 
-    Some changes are not seen: inside a container or array of more than a thousand items; inside a container that a
-    private attribute of a Keras object holds; and the change of a whole number to an equal float.
+    Some changes are not noticed: inside a container or array of more than a thousand items; inside a container in a
+    private attribute of a Keras object; and the change of a whole number to an equal float.
     """
 
     def __init__(self, *parts: Any) -> None:
@@ -133,7 +133,7 @@ class Watch:
             self._look(type(owner).__qualname__, lambda: {k: x for k, x in _attributes(owner).items() if k in names})
 
     def _visit_model(self, model: keras.Model) -> None:
-        """Visits the layers and the attributes that the model's own code uses; `fit` and `predict` add others."""
+        """Visits the layers, and the attributes that the model's own code uses; `fit` and `predict` add others."""
         self._visit(type(model))
         own = [f for c in type(model).__mro__ if not is_of_a_library(c) for f in vars(c).values()]
         names = {name for f in own if isinstance(f, FunctionType) for name in _names(f.__code__)} | {"call"}
@@ -146,7 +146,7 @@ class Watch:
         self._looks.append(_Look(type(part).__qualname__, lambda: attributes, dict(attributes)))
         for name, attribute in attributes.items():
             if name[0] != "_" or not isinstance(attribute, list | dict | tuple | set):
-                self._visit(attribute)  # Keras keeps its records in the other containers
+                self._visit(attribute)  # the other containers hold Keras' own records
 
     def _look(self, name: str, look: Callable[[], list | dict]) -> None:
         seen = look()
@@ -181,7 +181,7 @@ def _attributes(value: Any) -> dict[str, Any]:
 
 
 def _of_class(cls: type, names: frozenset[str] | None = None) -> dict[str, Any]:
-    """Returns a class's own attributes: all, or only those in `names`."""
+    """Returns a class's own attributes; with `names`, only these."""
     return {name: x for name, x in vars(cls).items() if names is None or name in names}
 
 

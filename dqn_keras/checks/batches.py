@@ -15,8 +15,8 @@ from dqn_keras.replay import Experience
 def as_batch(experiences: Sequence[Any], state_shape: tuple[int, ...], num_actions: int) -> Experience:
     """Returns any five arrays as a batch of tensors with the right dtypes.
 
-    Without the check of shapes, a reward of shape [B, 1] would silently broadcast against [B] to a loss over [B, B].
-    Values are not checked inside a tf.function, where they are not known.
+    Without the check of shapes, rewards of shape [B, 1] would silently broadcast against [B] to a loss over [B, B].
+    Values are not checked inside a tf.function, where they are unknown.
 
     Raises:
         ValueError: a field's shape, dtype or value is wrong; the message names the field.
@@ -77,7 +77,7 @@ _PLURALS = ("states", "actions", "rewards", "next_states", "terminal_states")
 
 
 def takes_a_batch(formula: Callable) -> Callable:
-    """Makes `formula` take any five arrays: they are checked and passed on as an Experience of tensors."""
+    """Makes `formula` accept any five arrays: checks them and passes them on as an Experience of tensors."""
 
     @functools.wraps(formula)
     def checked(

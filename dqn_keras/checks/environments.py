@@ -1,4 +1,4 @@
-"""Checks of an environment's spaces, and of what a gymnasium.Env returns (compiled: `loops/compiled.py`, `_step`)."""
+"""Checks of an environment's spaces and of a gymnasium.Env's return values (compiled: `loops/compiled.py`, `_step`)."""
 
 import math
 from collections.abc import Callable, Hashable
@@ -16,23 +16,23 @@ from dqn_keras.environments import key_of_twin
 
 
 class CheckedEnv:
-    """A gymnasium.Env with Box observations and Discrete actions, whose return values are checked.
+    """Plays a gymnasium.Env with Box observations and Discrete actions, and checks every value that it returns.
 
-    States are returned as copies [*S], since an environment may reuse its buffer. Actions are indices from 0.
-    A wrong return value raises ValueError with the environment's name, the episode and the step. The first states of a
-    run are also shown to its `watch`, if there is one.
+    States are returned as copies [*S], because an environment may reuse its buffer. Actions are indices from 0.
+    A wrong return value raises ValueError with the environment's name, the episode and the step. `watch`, if given,
+    also sees the first states of a run.
     """
 
     def __init__(self, env: gym.Env, watch: Watch | None = None) -> None:
         if not isinstance(env, gym.Env):
-            raise TypeError(f"env must be a gymnasium.Env, got {no_env(env)}")
+            raise TypeError(f"env must be a gymnasium.Env, got {not_an_env(env)}")
         self.name = env_name(env)
         self.spaces = spaces_of(env)
         self._env, self._watch = env, watch
         self._is_uint8 = self.spaces.state_dtype == np.uint8
 
     def reset(self, seed: int, episode: int) -> np.ndarray:
-        """Begins an episode with the given seed and returns its first state. `episode` is its number, for messages."""
+        """Begins an episode with this seed and returns its first state. `episode` is its number, for messages."""
         self._episode, self._step = episode, -1
         result = self._call(self._env.reset, seed=seed)
         if not (isinstance(result, tuple) and len(result) == 2):
@@ -40,7 +40,7 @@ class CheckedEnv:
         return self._checked_state(*result)
 
     def step(self, a: int) -> tuple[np.ndarray, float, bool, bool]:
-        """Takes the action of index `a` and returns next state, reward, terminated, truncated."""
+        """Takes the action with index `a` and returns next state, reward, terminated, truncated."""
         self._step += 1
         result = self._call(self._env.step, self.spaces.first_action + a)
         try:
@@ -94,22 +94,22 @@ class CheckedEnv:
 
 
 def env_name(env: gym.Env | FuncEnv) -> str:
-    """Returns the name by which messages call an environment: the id that it is registered by, or its class."""
+    """Returns the name of an environment for messages: its registered id or, without one, its class."""
     if isinstance(env, FuncEnv):
         return type(env).__name__
     return env.spec.id if env.spec else type(env.unwrapped).__name__
 
 
-def no_env(thing: Any) -> str:
-    """Returns the end of a message about something that is no environment: what it is, and what makes one of it."""
+def not_an_env(thing: Any) -> str:
+    """Returns the end of a message about something that is not an environment: what it is, and what to use instead."""
     if isinstance(thing, str):
-        return f'{thing!r}; gymnasium.make("{thing}") makes one'
+        return f'{thing!r}; use gymnasium.make("{thing}")'
     if isinstance(thing, gym.envs.registration.EnvSpec):
-        return f"the EnvSpec of {thing.id}; gymnasium.make(spec) makes one"
+        return f"the EnvSpec of {thing.id}; use gymnasium.make(spec)"
     if isinstance(thing, type) and issubclass(thing, gym.Env | FuncEnv):
-        return f"the class {thing.__name__}; {thing.__name__}() makes one"
+        return f"the class {thing.__name__}; use {thing.__name__}()"
     if isinstance(thing, gym.vector.VectorEnv):
-        return f"the vector environment {shown(thing)}; one environment is played at a time, as gymnasium.make makes it"
+        return f"the vector environment {shown(thing)}; use gymnasium.make: only one environment is played at a time"
     return shown(thing)
 
 
@@ -118,14 +118,14 @@ class Spaces(NamedTuple):
 
     state_shape: tuple[int, ...]
     state_dtype: np.dtype
-    """uint8 if the observations are uint8, as images are; otherwise float32."""
+    """uint8 if the observations are uint8, such as images; otherwise float32."""
     num_actions: int
     first_action: int
     """The environment's number for the action of index 0."""
 
 
 def some_states(space: Any, dtype: np.dtype, num_states: int = 8) -> np.ndarray:
-    """Returns states within the bounds of a space to test a network with, [num_states, *S]; always the same ones."""
+    """Returns states within a space's bounds to test a network with, [num_states, *S]; always the same ones."""
     rng = np.random.default_rng(0)
     normal, uniform = rng.normal(size=(num_states, *space.shape)), rng.random((num_states, *space.shape))
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
@@ -147,17 +147,17 @@ def check_spaces(name: str, observations: gym.Space, actions: gym.Space) -> Spac
     """Returns the sizes of the two spaces; raises ValueError if they are not supported."""
     if not isinstance(observations, gym.spaces.Box) or not observations.shape or 0 in observations.shape:
         raise ValueError(
-            f"env {name} has the observation space {observations}; supported is a Box of at least one axis "
+            f"env {name} has the observation space {observations}; it must be a Box with at least one axis "
             f"({way_to_a_box(observations)})"
         )
     if not isinstance(actions, gym.spaces.Discrete):
-        raise ValueError(f"env {name} has the action space {actions}; supported is Discrete")
+        raise ValueError(f"env {name} has the action space {actions}; it must be Discrete")
     dtype = np.dtype(np.uint8 if observations.dtype == np.uint8 else np.float32)
     return Spaces(observations.shape, dtype, int(actions.n), int(actions.start))
 
 
 def check_same_sizes(wish: str, wanted: Spaces, got: Spaces) -> None:
-    """Raises ValueError, with `wish` at its beginning, unless two environments have the same states and actions."""
+    """Raises ValueError, beginning with `wish`, unless two environments have the same states and actions."""
     shown_sizes = [
         f"with {x.state_dtype} states of shape {x.state_shape} and {x.num_actions} actions" for x in (wanted, got)
     ]
@@ -166,24 +166,24 @@ def check_same_sizes(wish: str, wanted: Spaces, got: Spaces) -> None:
 
 
 def way_to_a_box(space: gym.Space) -> str:
-    """Returns the end of a message about an observation space: which wrappers make a Box of it."""
+    """Returns the end of a message about an observation space: which wrappers convert it to a Box."""
     parts: dict[Any, gym.Space] = {}
     if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
         parts = dict(space.items() if isinstance(space, gym.spaces.Dict) else enumerate(space))
     keys = [key for key, part in parts.items() if can_flatten(part) and not isinstance(part, gym.spaces.Text)]
     if keys and len(keys) < len(parts):
         wrapped = f"gymnasium.wrappers.FilterObservation(env, {keys})"
-        return f"gymnasium.wrappers.FlattenObservation({wrapped}) makes one of a part of it"
+        return f"use gymnasium.wrappers.FlattenObservation({wrapped}) for a part of it"
     if can_flatten(space):
-        return "gymnasium.wrappers.FlattenObservation(env) makes one of it"
-    return "no wrapper of Gymnasium's makes a usable one of it, but a gymnasium.ObservationWrapper of your own can"
+        return "use gymnasium.wrappers.FlattenObservation(env)"
+    return "no wrapper of Gymnasium can convert it, but a gymnasium.ObservationWrapper of your own can"
 
 
 def can_flatten(space: gym.Space) -> bool:
-    """Returns whether Gymnasium's FlattenObservation makes a vector of the space that is not empty and not huge."""
+    """Returns whether Gymnasium's FlattenObservation makes a vector of this space that is neither empty nor huge."""
     try:
         return 0 < gym.spaces.flatdim(space) <= _LARGEST_VECTOR
-    except (NotImplementedError, ValueError):  # a space of the user's; a Sequence or a Graph, which have no fixed size
+    except (NotImplementedError, ValueError):  # the user's own space, or one without a fixed size (Sequence, Graph)
         return False
 
 

@@ -38,11 +38,11 @@ OTHER_NAMES = {
     "hidden_layers": ("number of units of each hidden layer", "hidden_units"),
     "epsilon_decay": ("factor that multiplies epsilon", "decay"),
 }
-"""What other libraries call a field, with what it is and its name here."""
+"""Names of fields in other libraries, with a description of the field and its name here."""
 
 
 def hints_at_fields(cls: type[T]) -> type[T]:
-    """Makes a frozen dataclass say what to write instead of an unknown field, and instead of an assignment."""
+    """Makes the errors of a frozen dataclass say what to write instead of an unknown field or an assignment."""
     names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
     init = cls.__init__
 

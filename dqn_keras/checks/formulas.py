@@ -15,7 +15,7 @@ class Formulas(NamedTuple):
     loss: str | Callable
 
     def check(self) -> None:
-        """Raises TypeError or ValueError if `learn` cannot take one of them."""
+        """Raises TypeError or ValueError if `learn` cannot use one of them."""
         if not callable(self.targets) or isinstance(self.targets, type | keras.Model):
             raise TypeError(f"targets must be a function like td_targets, got {shown(self.targets)}")
         if isinstance(self.loss, str):
@@ -49,7 +49,7 @@ class Formulas(NamedTuple):
         return tf.stop_gradient(y)
 
     def loss_of(self, y: tf.Tensor, q: tf.Tensor) -> tf.Tensor:
-        """Returns the loss of targets [B] and values [B], a scalar. A loss per transition is averaged."""
+        """Returns the loss of targets [B] and Q-values [B], a scalar. A loss per transition is averaged."""
         loss = self.loss_function()
         is_the_originals = loss is keras.losses.mean_squared_error  # called with two vectors, as in the original
         if isinstance(loss, keras.losses.Loss) or (isinstance(self.loss, str) and not is_the_originals):
@@ -62,7 +62,7 @@ class Formulas(NamedTuple):
 
 
 def called(name: str, function: Callable, *arguments: Any) -> Any:
-    """Calls the user's function; adds a note to an error of its own, which says that it is not the package's."""
+    """Calls the user's function; adds a note to its errors, which says that the function raised them."""
     try:
         return function(*arguments)
     except Exception as error:

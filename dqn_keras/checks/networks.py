@@ -44,7 +44,7 @@ def check_pair(q_network: keras.Model, q_hat_network: keras.Model) -> None:
 
 
 def check_fits(q_network: keras.Model, state_shape: tuple[int, ...], num_actions: int) -> None:
-    """Raises ValueError if the network does not fit the environment's states and actions, or has non-finite weights."""
+    """Raises ValueError if the network does not fit the environment, or if its weights are not finite."""
     check_network("q_network", q_network)
     takes, gives = q_network.input_shape, q_network.output_shape
     fits = isinstance(takes, tuple) and tf.TensorShape(takes).is_compatible_with((None, *state_shape))
@@ -70,11 +70,11 @@ def check_optimizer(optimizer: Any) -> None:
 
 
 def warn_of_inference_mode(network: keras.Model) -> None:
-    """Warns of layers that behave differently in training: a Q-network is always called in inference mode."""
+    """Warns of layers that behave differently in training, because a Q-network is always called in inference mode."""
     if names := [f"{x.name} ({type(x).__name__})" for x in all_layers(network) if _differs_in_training(x)]:
         warnings.warn(
-            f"q_network is called in inference mode, also while it learns: {', '.join(names)} will not do there what "
-            "model.fit would have it do",
+            f"q_network is called in inference mode, also while it learns: {', '.join(names)} will not behave as in "
+            "model.fit",
             stacklevel=5,
         )
 
@@ -82,7 +82,7 @@ def warn_of_inference_mode(network: keras.Model) -> None:
 def _differs_in_training(layer: keras.layers.Layer) -> bool:
     if isinstance(layer, keras.layers.BatchNormalization | keras.layers.SpectralNormalization):
         return True
-    if type(layer).__name__.endswith("Cell"):  # the RNN around it is one of the layers, too
+    if type(layer).__name__.endswith("Cell"):  # the RNN around it is one of the layers too
         return False
     if not type(layer).__module__.startswith("keras."):
         return "training" in inspect.signature(type(layer).call).parameters

@@ -13,7 +13,7 @@ LARGEST_COUNT = 2**31 - 1
 
 
 def shown(value: Any) -> str:
-    """Returns `repr(value)` for an error message, on one line, without the middle of what is long."""
+    """Returns `repr(value)` for an error message, on one line; leaves out the middle of a long text."""
     try:
         with np.printoptions(threshold=20, edgeitems=2):
             text = repr(value)
@@ -32,7 +32,7 @@ _LONGEST = 200
 
 def check_count(name: str, value: Any, at_least: int = 1) -> int:
     """Returns the whole number `value` as an int; otherwise raises TypeError or ValueError that names it."""
-    # The first test says the same of an int, in a tenth of the time: `sample_rows` runs at every update.
+    # For an int, the first test is enough and takes a tenth of the time: `sample_rows` runs at every update.
     is_whole = type(value) is int or (isinstance(value, Integral) and not isinstance(value, bool))
     if is_whole and at_least <= int(value) <= LARGEST_COUNT:
         return int(value)
@@ -63,13 +63,13 @@ def check_number(
 
 
 def unwrapped(value: Any) -> Any:
-    """Returns the number in an array or a tensor without axes; any other value as it is."""
+    """Returns the number in an array or tensor without axes; returns any other value unchanged."""
     has_no_axes = hasattr(value, "__array__") and getattr(value, "shape", None) == ()
     return np.asarray(value)[()] if has_no_axes else value
 
 
 def check_sequence(name: str, values: Any, what: str) -> list:
-    """Returns a list, a tuple, a range or an array of one axis as a list; otherwise raises TypeError."""
+    """Returns a list, tuple, range or array of one axis as a list; otherwise raises TypeError."""
     if isinstance(values, np.ndarray) and values.ndim == 1:
         return list(values)
     if isinstance(values, str | bytes | bytearray | memoryview) or not isinstance(values, Sequence):
@@ -106,7 +106,7 @@ def check_instance(name: str, value: Any, kind: Any, what: str) -> None:
 
 
 def check_rng(rng: Any) -> None:
-    """Raises TypeError unless `rng` is a random generator of NumPy's."""
+    """Raises TypeError unless `rng` is a NumPy random generator."""
     check_instance("rng", rng, np.random.Generator, "a numpy.random.Generator, such as numpy.random.default_rng(seed)")
 
 
@@ -121,11 +121,11 @@ def check_path(name: str, value: Any) -> Path:
 
 
 def check_array(name: str, value: Any, num_axes: int | None = None) -> np.ndarray:
-    """Returns an array, a tensor or nested lists of real numbers as an array; otherwise raises an error.
+    """Returns an array, a tensor or nested lists of real numbers as a NumPy array.
 
     Raises:
         TypeError: `value` is not an array of real numbers.
-        ValueError: it has another number of axes; None stands for any number.
+        ValueError: it does not have `num_axes` axes (None allows any number).
     """
     try:
         array = np.asarray(value)

@@ -1,4 +1,4 @@
-"""What an environment returns, looked at as numbers: conversions, and warnings of what is likely a mistake."""
+"""Observations and rewards as numbers: conversions, and warnings of likely mistakes."""
 
 import inspect
 import warnings
@@ -14,7 +14,7 @@ from dqn_keras.metrics import Episode
 
 
 def as_numbers(value: Any) -> np.ndarray | None:
-    """Returns `value` as an array of real numbers; None if it is none: text, dates, objects, or masked in part."""
+    """Returns `value` as an array of real numbers; None for text, dates, objects and partly masked arrays."""
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         return None
     try:
@@ -25,11 +25,11 @@ def as_numbers(value: Any) -> np.ndarray | None:
 
 
 def check_state(name: str, value: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """Returns one state as an array of `shape` and `dtype`, float32 or uint8; otherwise raises an error that names it.
+    """Returns one state as an array of this shape and dtype (float32 or uint8).
 
     Raises:
         TypeError: `value` is not an array of numbers.
-        ValueError: it has another shape, a value that is not finite in float32, or a dtype other than uint8 if the
+        ValueError: it has another shape, a value that is not finite in float32, or another dtype than uint8 where the
             states are uint8.
     """
     numbers = as_numbers(value)
@@ -47,7 +47,7 @@ def check_state(name: str, value: Any, shape: tuple[int, ...], dtype: np.dtype) 
 
 
 def as_float(value: Any) -> float | None:
-    """Returns a single number, also as an array of no axes, as a float; None if `value` is none."""
+    """Returns a single number, also one in an array without axes, as a float; None for any other value."""
     if type(value) not in _NUMBERS:
         if hasattr(value, "dtype"):
             array = as_numbers(value)
@@ -67,30 +67,30 @@ _NUMBERS = frozenset({float, int, bool, np.float64, np.float32, np.int64, np.int
 
 
 def feature_name(state_shape: tuple[int, ...], i: int) -> str:
-    """Returns the words for entry `i` of a flat state: feature 3, or feature (0, 3) if states have several axes."""
+    """Returns the name of entry `i` of a flat state: "feature 3", or "feature (0, 3)" if states have several axes."""
     index = tuple(map(int, np.unravel_index(i, state_shape)))
     return f"feature {index[0] if len(index) == 1 else index}"
 
 
 class Watch:
-    """Looks at the first 1,000 states of a run, and warns once of each thing in them that is likely a mistake.
+    """Looks at the first 1,000 states of a run, and warns once of each likely mistake in them.
 
     Args:
         name: the environment's name.
         space: its observation space, a Box.
-        is_default_network: whether the network was made by this package; one of the user's own may scale its input.
+        is_default_network: whether the package made the network; a network of the user may scale its input.
     """
 
     def __init__(self, name: str, space: Any, is_default_network: bool) -> None:
         self._name, self._space, self._is_default_network = name, space, is_default_network
-        self._num_to_see, self._is_mask_told = _NUM_STATES, False
+        self._num_to_see, self._has_warned_of_mask = _NUM_STATES, False
         self._precise: list[np.ndarray] = []  # observations that float32 may round
         self._num_precise = min(_NUM_STATES, _MOST_NUMBERS // space.low.size)
 
     def see(self, observation: np.ndarray, info: Any) -> bool:
-        """Looks at one observation, before it is rounded to float32, and its info; returns whether to show the next."""
-        if not self._is_mask_told and isinstance(info, dict) and "action_mask" in info:
-            self._is_mask_told = True
+        """Looks at one observation, not yet rounded to float32, and its info; returns whether it wants the next one."""
+        if not self._has_warned_of_mask and isinstance(info, dict) and "action_mask" in info:
+            self._has_warned_of_mask = True
             self._warn("info['action_mask'] is ignored: any action may be taken in any state")
         if len(self._precise) < self._num_precise and not np.can_cast(observation.dtype, np.float32):
             self._precise.append(np.array(observation, np.float64).ravel())
@@ -98,7 +98,7 @@ class Watch:
         return self._num_to_see > 0
 
     def over(self, episodes: Iterator[Episode], agent: Agent, config: Config) -> Generator[Episode, None, None]:
-        """Yields the same episodes, and looks at the agent's memory once: after 1,000 states, or else at the end."""
+        """Yields the same episodes, and looks at the agent's memory once: after 1,000 states, or at the end."""
         before, is_done = agent.memory.num_appended, False
         try:
             for episode in episodes:
@@ -122,10 +122,10 @@ class Watch:
             self._warn_of_rounding(np.stack(self._precise))
 
     def _warn_of_bounds(self, lowest: np.ndarray, highest: np.ndarray) -> None:
-        """Warns of a feature that is further outside its bounds than ten times the distance between them.
+        """Warns of a feature that is outside its bounds by more than ten times the distance between them.
 
-        With only one bound, ten times its size counts, or 10 if that is more. Gymnasium's own environments leave their
-        bounds by less: LunarLander-v3 by up to six times the distance.
+        With only one bound, the limit is ten times its size, or 10 if that is more. Gymnasium's own environments exceed
+        their bounds by less: LunarLander-v3 by up to six times the distance.
         """
         low, high = (x.astype(np.float64).ravel() for x in (self._space.low, self._space.high))
         one = 10 * np.maximum(1, np.minimum(np.abs(low), np.abs(high)))
@@ -141,7 +141,7 @@ class Watch:
             )
 
     def _warn_of_scale(self, largest: np.ndarray, is_uint8: bool) -> None:
-        """Warns the default network's user of inputs that are far from the size of 1."""
+        """Warns of inputs to the default network that are much larger than 1."""
         features = np.flatnonzero(largest > (1 if is_uint8 else _LARGE))
         if not len(features):
             return
@@ -154,10 +154,10 @@ class Watch:
         )
 
     def _warn_of_rounding(self, precise: np.ndarray) -> None:
-        """Warns of a feature that float32 shows as too few different numbers.
+        """Warns of a feature that float32 rounds to too few different numbers.
 
-        That is so if its range has fewer than 1,000 steps of float32, and a tenth of its changes from one state to the
-        next are lost in them. A range as small as the rounding of float64 counts as none.
+        This is the case if its range has fewer than 1,000 steps of float32, and float32 loses a tenth of its changes
+        from one state to the next. A range as small as the rounding of float64 does not count.
         """
         span, size = np.ptp(precise, axis=0), np.abs(precise).max(axis=0)
         is_coarse = (span > 1e-12 * size) & (span < 1_000 * np.spacing(size.astype(np.float32)))
@@ -167,8 +167,8 @@ class Watch:
         if len(features):
             i = int(features[0])
             self._warn(
-                f"{self._feature(i)} of the observations changes in steps that are lost in float32, in which states "
-                f"are stored (it is about {size[i]:.1e}): subtract an offset from it, and then scale it, in a "
+                f"{self._feature(i)} of the observations changes in steps that are lost in float32, the dtype of "
+                f"stored states (it is about {size[i]:.1e}): subtract an offset from it, and then scale it, in a "
                 "gymnasium.wrappers.TransformObservation"
             )
 

@@ -14,7 +14,7 @@ from gymnasium.experimental.functional import FuncEnv
 from dqn_keras._engine.private import arguments_of_compile
 from dqn_keras._engine.tensorflow import keras
 from dqn_keras.agent import owners_optimizer
-from dqn_keras.checks.environments import check_same_sizes, env_name, no_env, spaces_of
+from dqn_keras.checks.environments import check_same_sizes, env_name, not_an_env, spaces_of
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.checks.networks import check_optimizer, warn_of_inference_mode
 from dqn_keras.checks.numbers import check_count, check_flag, check_instance, check_path, check_sequence, shown
@@ -23,9 +23,9 @@ from dqn_keras.evaluation import Evaluation
 
 
 def check_arguments(env: gym.Env | FuncEnv, config: Config, verbose: int) -> None:
-    """Raises TypeError or ValueError that names the wrong argument, if there is one."""
+    """Raises TypeError or ValueError if an argument is wrong; the message names it."""
     if not isinstance(env, gym.Env | FuncEnv):
-        raise TypeError(f"env must be a gymnasium.Env or a FuncEnv, got {no_env(env)}")
+        raise TypeError(f"env must be a gymnasium.Env or a FuncEnv, got {not_an_env(env)}")
     spaces_of(env)
     check_instance("config", config, Config, "a Config")
     if not isinstance(verbose, Integral | np.bool_) or verbose not in (0, 1, 2):
@@ -50,7 +50,7 @@ def check_callbacks(
         check_instance("callbacks", callback, keras.callbacks.Callback, "Keras callbacks")
     evaluations = [callback for callback in callbacks if isinstance(callback, Evaluation)]
     if len(evaluations) > 1:
-        raise ValueError(f"callbacks must hold one Evaluation, as there is one greedy_return, got {len(evaluations)}")
+        raise ValueError(f"callbacks must hold only one Evaluation: each logs greedy_return, got {len(evaluations)}")
     for evaluation in evaluations:
         _check_evaluation(evaluation, env)
     return list(callbacks)
@@ -67,7 +67,7 @@ def _check_evaluation(evaluation: Evaluation, env: gym.Env | FuncEnv) -> None:
 
 
 def check_checkpoint(checkpoint: str | os.PathLike | None, checkpoint_every: int, resume: bool) -> int:
-    """Returns `checkpoint_every` as an int; raises TypeError or ValueError that names the wrong argument."""
+    """Returns `checkpoint_every` as an int; raises TypeError or ValueError if an argument is wrong."""
     if checkpoint is not None:
         check_path("checkpoint", checkpoint)
     if check_flag("resume", resume) and checkpoint is None:
@@ -76,7 +76,7 @@ def check_checkpoint(checkpoint: str | os.PathLike | None, checkpoint_every: int
 
 
 def check_seeds(seeds: Any) -> list[int]:
-    """Returns the seeds of a study as a list; raises TypeError or ValueError if one is wrong, or there twice."""
+    """Returns the seeds of a study as a list; raises TypeError or ValueError if one is wrong or repeated."""
     checked = [check_count("seeds", seed, at_least=0) for seed in check_sequence("seeds", seeds, "whole numbers")]
     if len(set(checked)) < len(checked):
         raise ValueError(f"seeds must name each seed once, got {shown(seeds)}")
@@ -92,7 +92,7 @@ def check_own_parts(
 ) -> Formulas:
     """Returns the formulas to learn with; raises TypeError or ValueError if one of the parts cannot be used.
 
-    Warns of settings of the parts that have no effect or another effect than in `model.fit`.
+    Warns of settings that have no effect, or another effect than in `model.fit`.
     """
     if optimizer is not None:
         check_optimizer(optimizer)
@@ -100,7 +100,7 @@ def check_own_parts(
     if loss is None and q_network is not None and q_network.compiled:
         loss = getattr(q_network, "loss", None)
         if isinstance(loss, list | tuple | dict):
-            raise ValueError(f"q_network must be compiled with one loss, got {shown(loss)}; or give train a loss")
+            raise ValueError(f"q_network must be compiled with one loss, got {shown(loss)}; or pass loss to train")
     if owners is not None:
         config_of_compile = arguments_of_compile(q_network)
         ignored = [x for x in _IGNORED if config_of_compile.get(x)]
@@ -127,12 +127,12 @@ def check_learning_rate(optimizer: keras.Optimizer, config: Config) -> None:
     is_alpha = isinstance(rate, keras.Variable) and math.isclose(rate.numpy(), config.alpha, rel_tol=1e-6)
     if config.alpha != Config.alpha and not is_alpha:
         raise ValueError(
-            f"alpha must be left at its default of {Config.alpha} with an optimizer of your own, whose learning rate "
-            f"counts, got {config.alpha}"
+            f"alpha must be left at its default of {Config.alpha} with an optimizer of your own, because the "
+            f"optimizer's learning rate is used, got {config.alpha}"
         )
     if isinstance(rate, int | float):
         warnings.warn(
-            f"the learning rate of {optimizer.name!r} is a Python function, which is called once, when the learning "
-            f"step is compiled: it stays at {rate}; a keras.optimizers.schedules.LearningRateSchedule would change",
+            f"the learning rate of {optimizer.name!r} is a Python function, which is called only once, so it stays at "
+            f"{rate}: use a keras.optimizers.schedules.LearningRateSchedule for a rate that changes",
             stacklevel=5,
         )

@@ -1,4 +1,4 @@
-"""Checks of the settings of a study or a sweep, all before any work starts."""
+"""Checks of the settings of a study or a sweep, before any work starts."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -28,7 +28,7 @@ def check_settings(
     """Returns the settings of a sweep.
 
     Raises:
-        TypeError, ValueError: a setting is not a Config or a dict of arguments, or what they share is wrong.
+        TypeError, ValueError: a setting is not a Config or a dict of arguments, or a shared argument is wrong.
     """
     check_arguments(env, Config(), verbose)
     if evaluate_on is not None:
@@ -53,10 +53,10 @@ _MAY_DIFFER = ("env", "config", "q_network", "optimizer", "targets", "loss", "ev
 
 
 def check_setting(name: str, setting: Setting, verbose: int, has_file: bool) -> dict[str, Any]:
-    """Returns the identity of a setting, empty without a file.
+    """Checks a setting and returns its identity, which is empty without a file.
 
     Raises:
-        TypeError, ValueError: something in it is wrong; in a sweep, the message begins with the setting's name.
+        TypeError, ValueError: an argument is wrong; in a sweep, the message begins with the setting's name.
     """
     try:
         return _checked(setting, verbose, has_file)
@@ -78,8 +78,8 @@ def _checked(setting: Setting, verbose: int, has_file: bool) -> dict[str, Any]:
         return {}
     optimizer = parts["optimizer"] or owners_optimizer(parts["q_network"])
     facts = identity(setting.env, setting.config, agent, formulas, parts["q_network"], optimizer).facts
-    place = setting.evaluate_on
-    return identity_with(facts, evaluate_on=Part("nothing") if place is None else describe(place)[0])
+    where = setting.evaluate_on
+    return identity_with(facts, evaluate_on=Part("nothing") if where is None else describe(where)[0])
 
 
 def _check_makes_new(name: str, takes: tuple[str, ...], function: Any, arguments: tuple, kind: type) -> None:
@@ -97,8 +97,8 @@ def _check_makes_new(name: str, takes: tuple[str, ...], function: Any, arguments
         raise ValueError(f"{wanted}, got one that returns the same object again")
 
 
-def _check_evaluate_on(env: gym.Env | FuncEnv, place: Any) -> None:
-    if not isinstance(place, gym.Env | FuncEnv):
-        raise TypeError(f"evaluate_on must be a gymnasium.Env or a FuncEnv, got {shown(place)}")
-    spaces = check_functional(place) if isinstance(place, FuncEnv) else spaces_of(place)
+def _check_evaluate_on(env: gym.Env | FuncEnv, evaluate_on: Any) -> None:
+    if not isinstance(evaluate_on, gym.Env | FuncEnv):
+        raise TypeError(f"evaluate_on must be a gymnasium.Env or a FuncEnv, got {shown(evaluate_on)}")
+    spaces = check_functional(evaluate_on) if isinstance(evaluate_on, FuncEnv) else spaces_of(evaluate_on)
     check_same_sizes(f"evaluate_on must be an environment like env {env_name(env)}", spaces_of(env), spaces)

@@ -9,7 +9,7 @@ from dqn_keras.checks.numbers import check_array, check_count, check_number, sho
 
 
 def check_transition(experience: Any, state_shape: tuple[int, ...], dtype: np.dtype) -> tuple[Any, ...]:
-    """Returns the five fields of a transition; raises TypeError or ValueError that names the field that is wrong."""
+    """Returns the five fields of a transition; raises TypeError or ValueError that names a wrong field."""
     if not isinstance(experience, list | tuple) or len(experience) != 5:
         raise TypeError(f"experience must be an Experience, or its five fields, got {shown(experience)}")
     state, action, reward, next_state, terminal_state = experience

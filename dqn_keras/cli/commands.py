@@ -1,4 +1,4 @@
-"""The commands of the command line: each takes its options and returns its exit code."""
+"""The commands of `dqn-keras`: each takes its options and returns its exit code."""
 
 import contextlib
 import os
@@ -31,14 +31,14 @@ def train(options: "cli.Train") -> int:
     seed = checked_seed(options.seed)
     folder = options.out or _default_folder(options.env, str(seed))
     settings = Settings(_env_options(options), seed, options.config, options.tensorboard, options.double, options.loss)
-    return _tell(run_folder.begin(folder, settings, _verbosity(options.quiet)), folder, options)
+    return _report(run_folder.begin(folder, settings, _verbosity(options.quiet)), folder, options)
 
 
 def resume(options: "cli.Resume") -> int:
-    """Continues the run of a folder."""
+    """Continues the run in a folder."""
     verbose = _verbosity(options.quiet)
     run = run_folder.resume(options.folder, options.num_episodes, verbose, options.import_module)
-    return _tell(run, options.folder, options)
+    return _report(run, options.folder, options)
 
 
 def watch(options: "cli.Watch") -> int:
@@ -74,8 +74,8 @@ def study(options: "cli.Study") -> int:
     folder = options.out or _default_folder(options.env, "study")
     if options.config.num_episodes < options.config.solved_window:
         raise ValueError(
-            f"num_episodes must be at least solved_window={options.config.solved_window} in a study, whose curves are "
-            f"means over it, got {options.config.num_episodes}"
+            f"num_episodes must be at least solved_window={options.config.solved_window} in a study, because the "
+            f"curves are means over it, got {options.config.num_episodes}"
         )
     own = run_folder.own_formulas(options.double, options.loss)
     trained = train_seeds(_make_env(options), options.config, **own, **_how(options), file=folder / "study.npz")
@@ -116,7 +116,7 @@ def _how(options: "cli.Study | cli.Sweep") -> dict[str, Any]:
 
 
 def plot(options: "cli.Plot") -> int:
-    """Draws the curves of a folder."""
+    """Draws the curves of the run, study or sweep in a folder."""
     print(f"The curves are in {run_folder.draw(options.folder)}")
     return 0
 
@@ -134,8 +134,8 @@ def _default_folder(env_id: str, name: str) -> Path:
     return Path("runs", f"{env_id.replace('/', '-').replace(':', '-')}-{name}")
 
 
-def _tell(run: Run, folder: Path, options: "cli.Train | cli.Resume") -> int:
-    """Prints how a run has ended, and returns the exit code."""
+def _report(run: Run, folder: Path, options: "cli.Train | cli.Resume") -> int:
+    """Prints how a run ended, and returns the exit code."""
     if run.interrupted:
         return _interrupted(how_to_resume(options, folder))
     if not options.quiet:

@@ -1,4 +1,4 @@
-"""The options of the command line, and how it reports errors. The commands themselves are in `commands`.
+"""The options of the command line, and its error messages. The commands themselves are in `commands`.
 
 TensorFlow and Gymnasium are imported only when a command runs, so that `--help` appears at once.
 """
@@ -34,7 +34,7 @@ Module = Annotated[str | None, arg(name="import", metavar="MODULE", help_behavio
 
 @dataclasses.dataclass(frozen=True)
 class _Unchecked(Config):
-    """The parameters as they were typed. Config checks them later, so that tyro puts no box around its messages."""
+    """The parameters as typed. Config checks them later, so that tyro puts no box around its messages."""
 
     def __post_init__(self) -> None:
         """Checks nothing."""
@@ -56,7 +56,7 @@ class _Task:
     """Compile whole episodes. This takes seconds; training is then about ten times as fast.
     Only for CartPole-v1, Acrobot-v1 and MountainCar-v0, which have a functional twin."""
     preset: Flag = False
-    """Start from parameters that are known to solve ENV, not from the original's; typed ones replace them."""
+    """Start from parameters that are known to solve ENV, not from the original's. Those that you type replace them."""
     double: Flag = False
     """Use the targets of Double DQN."""
     loss: Annotated[str, arg(metavar="NAME")] = "mse"
@@ -65,9 +65,9 @@ class _Task:
 
 @dataclasses.dataclass(kw_only=True)
 class Train(_Task):
-    """Train an agent and keep it in a folder."""
+    """Train an agent and save it in a folder."""
 
-    seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: drawn)")] = None
+    seed: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: random)")] = None
     """Seed of the run. The same seed gives the same run, bit for bit."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: runs/ENV-SEED)")] = None
     """Folder for the run, with these files:
@@ -75,7 +75,7 @@ class Train(_Task):
     log.csv (a line for each episode),
     agent.keras (the network),
     curve.png, and checkpoint/, from which `resume` continues.
-    Ctrl-C ends the run at the end of an episode and keeps everything."""
+    Ctrl-C stops the run at the end of an episode and saves everything."""
     tensorboard: Flag = False
     """Also write every scalar for TensorBoard, into the folder's tensorboard/ (slower)."""
     quiet: Flag = False
@@ -84,20 +84,20 @@ class Train(_Task):
 
 @dataclasses.dataclass(kw_only=True)
 class _Kept:
-    """A run that is kept in a folder."""
+    """A run that is saved in a folder."""
 
     folder: Folder
     """Folder of the run."""
     import_module: Annotated[str | None, arg(name="import", metavar="MODULE", help_behavior_hint="(default: none)")] = (
         None
     )
-    """Module that registers the environment, from the current folder or installed. Importing it runs its code, so it
-    must be named here; a folder's own files never import anything."""
+    """Module that registers the environment, in the current folder or installed. Importing it runs its code, so you
+    must name it here; the files in FOLDER alone never import anything."""
 
 
 @dataclasses.dataclass(kw_only=True)
 class Resume(_Kept):
-    """Continue an interrupted or killed run, or make a run longer: bit for bit as without a break."""
+    """Continue an interrupted or killed run, or make a run longer. The result is the same as without a break."""
 
     num_episodes: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: as before)")] = None
     """Maximum number of episodes."""
@@ -107,7 +107,7 @@ class Resume(_Kept):
 
 @dataclasses.dataclass(kw_only=True)
 class Watch(_Kept):
-    """Watch the agent play in a window or, without a display, in a GIF, which is written to the folder."""
+    """Watch the agent play in a window. Without a display, write a GIF to the folder."""
 
     episodes: int = 3
     """Number of episodes in the window; the GIF shows only the first."""
@@ -129,7 +129,7 @@ class Evaluate(_Kept):
 
 @dataclasses.dataclass(kw_only=True)
 class _ManySeeds(_Task):
-    """An environment, how to learn it, and with which seeds."""
+    """An environment, how to learn it, and the seeds."""
 
     seeds: int = 100
     """Number of seeds; they are 0, 1, 2, ..."""
@@ -159,7 +159,7 @@ class Sweep(_ManySeeds):
     All combinations are trained."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: runs/ENV-sweep)")] = None
     """Folder for the sweep: sweep.npz, sweep.csv (a line for each seed) and sweep.png.
-    If you repeat the command, it trains only what is missing; other values are added."""
+    If you repeat the command, it trains only what is missing, and adds new values."""
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -167,11 +167,11 @@ class Plot:
     """Draw the picture of a study, a sweep or a run, even while it is in progress."""
 
     folder: Folder
-    """Folder of the run, the study or the sweep; the picture is written there: curve.png, study.png or sweep.png."""
+    """Folder of the run, study or sweep. The picture is written there: curve.png, study.png or sweep.png."""
 
 
 def parse(arguments: Sequence[str]) -> Any:
-    """Returns the command with its options, checked. After the help or an error, tyro raises SystemExit."""
+    """Returns the command with its checked options. After the help or an error, tyro raises SystemExit."""
     commands: Any = Train | Resume | Watch | Evaluate | Study | Sweep | Plot
     description = "Train Deep Q-Networks on Gymnasium's environments."
     try:
@@ -196,12 +196,12 @@ def _preset(env: str) -> Config:
     from dqn_keras.presets import presets
 
     if env not in presets:
-        raise ValueError(f"preset is there for {', '.join(presets)}, got {env}")
+        raise ValueError(f"preset exists for {', '.join(presets)}, got {env}")
     return presets[env]
 
 
 def _hint(arguments: Sequence[str]) -> str | None:
-    """Returns what to write instead of a common slip in arguments that cannot be read."""
+    """Returns a hint on a common mistake in arguments that tyro cannot read; None if there is none."""
     names = [command.__name__.lower() for command in (Train, Resume, Watch, Evaluate, Study, Sweep, Plot)]
     if not arguments:
         return None
@@ -227,7 +227,7 @@ def _hint(arguments: Sequence[str]) -> str | None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line and returns its exit code: 0, 2 after an error, 130 after Ctrl-C, 141 after a broken pipe.
 
-    An error is one line on standard error; for an option that cannot be read, it is a box with the option's help.
+    Prints an error as one line on standard error or, for an option that cannot be read, as a box with help.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments == ["--version"]:
@@ -248,11 +248,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as end:  # tyro has printed the help or the error
         return int(end.code or 0)
     except KeyboardInterrupt:
-        print(f"Interrupted{_how_to_go_on(command)}", file=sys.stderr)
+        print(f"Interrupted{_how_to_continue(command)}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # nobody reads the rest, for example after `| head`
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (for the interpreter's last flush)
-        print(f"dqn-keras: nobody reads the output{_how_to_go_on(command)}", file=sys.stderr)
+        print(f"dqn-keras: nobody reads the output{_how_to_continue(command)}", file=sys.stderr)
         return 141
     except Exception as error:
         if not _says_it_all(error):
@@ -261,7 +261,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _import_from_this_folder(command: Any) -> None:
-    """Imports the module that was typed, if any; only then the current folder is searched for modules."""
+    """Imports the module that was typed, if any. Only in that case, modules in the current folder are found."""
     if module := _module_of(command):
         sys.path.append(os.getcwd())
         importlib.import_module(module)
@@ -277,15 +277,15 @@ def how_to_resume(command: Any, folder: Path) -> str:
     return f"dqn-keras resume {shlex.quote(str(folder))}" + (f" --import {module}" if module else "")
 
 
-def _how_to_go_on(command: Any) -> str:
-    """Returns a hint on how to continue, if the run has begun."""
+def _how_to_continue(command: Any) -> str:
+    """Returns a hint on how to continue the run; empty if it has not begun."""
     folder = getattr(command, "folder", None) or getattr(command, "out", None)
     is_run = isinstance(command, Train | Resume) and folder is not None and (folder / "config.json").exists()
     return f". To continue: {how_to_resume(command, cast(Path, folder))}" if is_run else ""
 
 
 def _says_it_all(error: Exception) -> bool:
-    """Returns whether the message is enough; an error in an environment's code has a note and needs its traceback."""
+    """Returns whether the message is enough. An error in an environment's code has a note, and needs its traceback."""
     is_known = isinstance(error, ValueError | TypeError | OSError | ImportError)
     is_known |= type(error).__module__ == "gymnasium.error"
     return is_known and not hasattr(error, "__notes__")

@@ -1,4 +1,4 @@
-"""The folder of a run of the command line: its files, and how a run starts and continues there."""
+"""The folder of a run on the command line: its files, and how a run starts and continues there."""
 
 import ast
 import contextlib
@@ -34,7 +34,7 @@ from dqn_keras.training import Run, train
 
 @dataclasses.dataclass(frozen=True)
 class EnvOptions:
-    """The options that an environment is made from."""
+    """The options for making an environment."""
 
     id: str
     arguments: dict[str, Any]
@@ -43,10 +43,10 @@ class EnvOptions:
 
     @classmethod
     def parse(cls, id: str, arguments: Sequence[str], flatten: bool, compiled: bool) -> "EnvOptions":
-        """Reads the command line's words; ValueError if there is no functional twin or a word is not NAME=VALUE."""
+        """Parses NAME=VALUE words; raises ValueError if one has another form, or if there is no functional twin."""
         if compiled and (id not in environments.TWINS or arguments or flatten):
             raise ValueError(
-                f"compiled episodes are for {', '.join(environments.TWINS)} as they are, without arguments or flatten, "
+                f"compiled is only for {', '.join(environments.TWINS)}, without env_args or flatten, "
                 f"got {' '.join([id, *arguments])}"
             )
         values = {}
@@ -62,18 +62,18 @@ class EnvOptions:
 
     def make(self, render_mode: str | None = None) -> gym.Env:
         """Makes the Gymnasium environment."""
-        rendering: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}  # not all know it
+        rendering: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}  # not all take it
         try:
             env = gym.make(self.id, **rendering, **self.arguments)
         except (gym.error.Error, ImportError):
             raise
-        except Exception as error:  # in the environment's code, about an argument that it does not take
+        except Exception as error:  # the environment's own code rejects an argument
             arguments = "".join(f" {name}={value!r}" for name, value in self.arguments.items())
             raise ValueError(f"{self.id}{arguments} cannot be made: {type(error).__name__}: {error}") from error
         space = env.observation_space
         is_flat = self.flatten and can_flatten(space)
         if not is_flat and (self.flatten or not isinstance(space, gym.spaces.Box)):
-            way = "--flatten makes one axis of it" if can_flatten(space) else way_to_a_box(space)
+            way = "use --flatten" if can_flatten(space) else way_to_a_box(space)
             raise ValueError(f"{self.id} has the observation space {space}; {way}")
         return gym.wrappers.FlattenObservation(env) if is_flat else env
 
@@ -100,7 +100,7 @@ def own_formulas(double: bool, loss: str) -> dict[str, Any]:
 
 
 def write_settings(folder: Path, settings: Settings) -> None:
-    """Writes config.json, together with the software versions of the run."""
+    """Writes config.json, with the software versions of the run."""
     content = {
         "environment": dataclasses.asdict(settings.env),
         "seed": settings.seed,
@@ -115,7 +115,7 @@ def write_settings(folder: Path, settings: Settings) -> None:
 
 
 def read_settings(folder: Path) -> Settings:
-    """Reads config.json; raises an error if there is none or if something in it is wrong."""
+    """Reads config.json; raises FileNotFoundError if there is none, ValueError if something in it is wrong."""
     path = folder / "config.json"
     if not path.exists():
         raise FileNotFoundError(f"{folder} holds no run: there is no config.json in it")
@@ -128,37 +128,36 @@ def read_settings(folder: Path) -> Settings:
         names = ("tensorboard", "double", "loss")
         return Settings(env, content["seed"], Config(**config), *(content[name] for name in names))
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is not as `dqn-keras train` writes it: {error}") from None
+        raise ValueError(f"{path} is not what `dqn-keras train` writes: {error}") from None
 
 
 def read_settings_to_play(folder: Path, imported: str | None) -> Settings:
-    """Reads config.json for making its environment; raises an error if that would import a module not `imported`.
+    """Reads config.json; raises ValueError if making its environment would import a module other than `imported`.
 
-    Gymnasium imports the module in an id MODULE:ID, and so would run code that the sender of a folder has chosen.
+    Gymnasium imports the module in an id MODULE:ID, and so could run code that the sender of a folder has chosen.
     """
     settings = read_settings(folder)
     for name in (settings.env.id, settings.env.arguments.get("env_id", "")):
         module, is_named, _ = str(name).rpartition(":")
         if is_named and module != imported:
             raise ValueError(
-                f"{folder} names the module {module!r}, which is not imported unasked, because that runs its code; "
-                f"if you trust it: --import {module}"
+                f"{folder} needs the module {module!r}. Importing it runs its code; if you trust it: --import {module}"
             )
     return settings
 
 
 def read_q_network(folder: Path) -> keras.Model:
-    """Loads the network of a run that has ended."""
+    """Loads the network of a finished run."""
     if not (folder / "agent.keras").exists():
         raise FileNotFoundError(
-            f"{folder} has no agent.keras: its run is in progress or was killed; to continue it: "
-            f"dqn-keras resume {folder}"
+            f"{folder} has no agent.keras: its run is in progress or was killed; "
+            f"to continue it: dqn-keras resume {folder}"
         )
     return load_q_network(folder / "agent.keras")
 
 
 def begin(folder: Path, settings: Settings, verbose: int) -> Run:
-    """Starts a run in a folder that holds none yet."""
+    """Starts a run in a folder that does not hold one yet."""
     env = settings.env.make_for_training()
     check_environment(env)  # before the folder is made
     Formulas(**own_formulas(settings.double, settings.loss)).check()
@@ -173,7 +172,7 @@ def begin(folder: Path, settings: Settings, verbose: int) -> Run:
 
 
 def resume(folder: Path, num_episodes: int | None, verbose: int, imported: str | None = None) -> Run:
-    """Continues a run, with another maximum number of episodes if `num_episodes` is given."""
+    """Continues a run, up to `num_episodes` episodes if this is given."""
     before = settings = read_settings_to_play(folder, imported)
     if num_episodes is not None:
         config = dataclasses.replace(settings.config, num_episodes=num_episodes)
@@ -220,7 +219,7 @@ def _train(folder: Path, env: Any, settings: Settings, verbose: int, resume: boo
 
 
 def _write_log(log: Path, history: dict[str, list[float]]) -> None:
-    """Writes log.csv as keras.callbacks.CSVLogger does, but without repeats or gaps, from the run's whole history."""
+    """Writes log.csv from the whole history, in the format of keras.callbacks.CSVLogger, without repeats or gaps."""
     names = sorted(history)
     with replacing(log) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -237,7 +236,7 @@ def write_columns(path: Path, columns: Mapping[str, np.ndarray]) -> None:
 
 
 def read_log(folder: Path) -> dict[str, list[float]]:
-    """Returns log.csv in the form of `run.history`. An episode played twice, after a kill, counts with its last row."""
+    """Returns log.csv in the form of `run.history`. If an episode was played twice, its last row counts."""
     rows: dict[int, dict[str, float]] = {}
     if (folder / "log.csv").exists():
         with (folder / "log.csv").open(newline="") as file:

@@ -11,9 +11,9 @@ from dqn_keras.config import Config
 
 
 def varied(config: Config, words: Sequence[str], formulas: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Returns a setting, as for `sweep`, for each combination of the values in words NAME=VALUE,VALUE.
+    """Returns a setting for `sweep` for each combination of the values in words NAME=VALUE,VALUE.
 
-    A name is a field of Config, or `loss` or `double`, whose values otherwise are those of `formulas`.
+    A name is a field of Config, `loss` or `double`. `formulas` holds the default values of the last two.
     """
     names = [field.name for field in dataclasses.fields(Config)]
     choices: list[list[tuple[str, str, Any]]] = []
@@ -21,7 +21,7 @@ def varied(config: Config, words: Sequence[str], formulas: Mapping[str, Any]) ->
         name, is_assignment, values = word.partition("=")
         name = name.replace("-", "_")
         if not (is_assignment and name in (*names, *formulas)):
-            raise ValueError(f"vary must be of the form NAME=VALUE,VALUE with a name of --help, got {word!r}")
+            raise ValueError(f"vary must be of the form NAME=VALUE,VALUE with a name from --help, got {word!r}")
         choices.append([(name, value, _read(name, value)) for value in values.split(",")])
     settings = {}
     for combination in itertools.product(*choices):
@@ -35,7 +35,7 @@ def varied(config: Config, words: Sequence[str], formulas: Mapping[str, Any]) ->
 
 
 def _read(name: str, value: str) -> Any:
-    """Returns the value of a word; 128x128 stands for two layers, a word that is no Python value for itself."""
+    """Returns the value of a word. 128x128 means two layers; a word that is not a Python value is a string."""
     if name == "hidden_units":
         value = f"({value.replace('x', ',')},)"
     try:

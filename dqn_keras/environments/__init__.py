@@ -10,13 +10,13 @@ from dqn_keras.environments.cartpole import CartPole
 from dqn_keras.environments.mountain_car import MountainCar
 
 TWINS = {"CartPole-v1": CartPole, "Acrobot-v1": Acrobot, "MountainCar-v0": MountainCar}
-"""The functional twins, each under the id of the Gymnasium environment with the same dynamics."""
+"""The functional twins, by the id of the Gymnasium environment with the same dynamics."""
 
 
 def key_of_twin(env: Any) -> Hashable | None:
-    """Returns a key that is equal for environments that compute the same; None if `env` is not a twin as it was made.
+    """Returns a key that is equal for environments that compute the same; None if `env` is not an unchanged twin.
 
-    The key has the twin's constants, because a user may change them to try other physics.
+    The key includes the twin's constants, because a user may change them to try other physics.
     """
     cls = type(env)
     if cls not in TWINS.values() or vars(env) != vars(cls()):

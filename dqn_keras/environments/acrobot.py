@@ -1,4 +1,4 @@
-"""Acrobot-v1 (Sutton 1996; the dynamics of Sutton and Barto's book) with Gymnasium's constants."""
+"""Acrobot-v1 (Sutton 1996) with Gymnasium's constants and the dynamics of Sutton and Barto's book."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ DT = 0.2  # s, one step
 
 
 class Acrobot(FuncEnv):
-    """A double pendulum with a motor at its elbow. State, [4] float64: both angles, both angular velocities.
+    """A double pendulum with a motor at its elbow. The state, [4] float64: both angles, both angular velocities.
 
     The episode terminates when the tip is one length above the joint, and is truncated after 500 steps. Every step
     gives a reward of -1, except the step that terminates, which gives 0.
@@ -44,7 +44,7 @@ class Acrobot(FuncEnv):
         return tf.concat([angles, tf.clip_by_value(state[2:], -limits, limits)], axis=0)
 
     def observation(self, state: tf.Tensor, rng: tf.Tensor, params: Any = None) -> tf.Tensor:
-        """Returns cosine and sine of the first angle, then of the second, and both velocities, [6] float32."""
+        """Returns cosine and sine of the first angle, then of the second, then both velocities, [6] float32."""
         cos, sin = tf.cos(state[:2]), tf.sin(state[:2])
         return tf.cast(tf.stack([cos[0], sin[0], cos[1], sin[1], state[2], state[3]]), tf.float32)
 

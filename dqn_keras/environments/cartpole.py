@@ -21,7 +21,7 @@ MAX_POSITION = 2.4  # m
 
 
 class CartPole(FuncEnv):
-    """A pole on a cart. State, [4] float64: position, velocity, angle, angular velocity.
+    """A pole on a cart. The state, [4] float64: position, velocity, angle, angular velocity.
 
     Every step gives a reward of 1. The episode terminates when the pole leans more than 12 degrees or the cart is more
     than 2.4 m from the middle, and is truncated after 500 steps.

@@ -14,9 +14,9 @@ FORCE, GRAVITY = 0.001, 0.0025
 
 
 class MountainCar(FuncEnv):
-    """A car that is too weak for its hill. State, [2] float64: position, velocity.
+    """A car that is too weak for its hill. The state, [2] float64: position, velocity.
 
-    Every step gives a reward of -1. The episode terminates on the hill, and is truncated after 200 steps.
+    Every step gives a reward of -1. The episode terminates at the goal on the hill, and is truncated after 200 steps.
     """
 
     observation_space = spaces.Box(

@@ -49,8 +49,8 @@ def episodes(
     """Plays and learns until the run's last episode, and yields each episode; `agent` is changed in place.
 
     One call of the program plays up to `episodes_per_call` episodes (at most 100), or for about `_SECONDS_PER_CALL`, so
-    that a run can be interrupted. It returns early if the stop rule may hold. The agent then has the state of the end
-    of that episode. The results do not depend on `episodes_per_call`.
+    that a run can be interrupted. It returns early, after the episode at which the stop rule may hold. The results do
+    not depend on `episodes_per_call`.
     """
     memory = agent.memory
     rows = tf.Variable(memory.rows)
@@ -102,7 +102,7 @@ class _Numbers(NamedTuple):
     num_steps: Any  # int64, of the run
     max_steps: Any  # int32, of an episode
     epsilons: Any  # [_CAPACITY] float32
-    line: Any  # [3] float32, the first and the lowest epsilon of a straight line, and its number of steps
+    line: Any  # [3] float32, the first and the lowest epsilon of a linear fall, and its number of steps
     learning_starts: Any  # int64
     num_before_updates: Any  # int64
     gradient_steps_per_target: Any  # int64
@@ -167,7 +167,7 @@ def _bind_program(
 
 
 def _shape_of_program(config: Config) -> tuple:
-    """Returns what the traced program depends on; all other numbers are inputs."""
+    """Returns the values that the traced program depends on; all other numbers are its inputs."""
     sizes = (config.memory_size, config.batch_size, config.steps_per_update, config.gradient_steps)
     has_line, has_warm_up = config.epsilon_steps is not None, config.learning_starts > 0
     return (*sizes, config.steps_count_from, config.gradient_steps_per_target > 1, has_line, has_warm_up)
@@ -209,7 +209,7 @@ def _records(
 
 
 class _Loop:
-    """The program that is traced."""
+    """The program that TensorFlow traces."""
 
     def __init__(
         self,
@@ -230,7 +230,7 @@ class _Loop:
         key, first, num_episodes = self._numbers.key, self._numbers.first, self._numbers.num_episodes
         recent, window = self._numbers.recent, self._numbers.recent.shape[0]
 
-        def is_to_go_on(i: tf.Tensor, totals: _Totals, fault: tf.Tensor) -> tf.Tensor:
+        def must_continue(i: tf.Tensor, totals: _Totals, fault: tf.Tensor) -> tf.Tensor:
             # `train` decides whether to stop. The bound here is a little lower, in case the two round differently.
             may_be_solved = tf.reduce_mean(totals.reward[i : i + window]) > self._numbers.solved_reward - 1e-6
             is_left = (i < num_episodes) & (self._num_appended < self._numbers.num_steps)
@@ -245,11 +245,11 @@ class _Loop:
         integers, floats = tf.zeros([_CAPACITY], tf.int32), tf.zeros([_CAPACITY])
         rewards = tf.concat([recent, tf.zeros([_CAPACITY], tf.float64)], axis=0)
         totals = _Totals(rewards, integers, tf.zeros([_CAPACITY, 3]), floats, floats, integers, integers > 0)
-        played, totals, fault = tf.while_loop(is_to_go_on, play_one, (tf.constant(0), totals, tf.constant(0)))
+        played, totals, fault = tf.while_loop(must_continue, play_one, (tf.constant(0), totals, tf.constant(0)))
         return played, *totals._replace(reward=totals.reward[window:]), fault
 
     def _play_episode(self, key: tf.Tensor, epsilon: tf.Tensor) -> tuple[_Totals, tf.Tensor]:
-        """Plays an episode -> its _Totals, and what was not finite in it, as an index of _FAULTS."""
+        """Plays an episode -> its _Totals, and an index of _FAULTS: what was not finite in it."""
         rng = reset_rng(key)
         state = self._env.initial(rng)
         observation = self._observation(state, rng)
@@ -264,7 +264,7 @@ class _Loop:
         return totals, fault
 
     def _steps_since_update(self) -> Any:
-        """Returns how many steps before an episode the count for `steps_per_update` was at a multiple of it."""
+        """Returns, at the start of an episode, the env steps since the last multiple of `steps_per_update`."""
         if self._config.steps_count_from == "episode":
             return 0
         return tf.cast(self._num_appended % self._config.steps_per_update, tf.int32)
@@ -290,7 +290,7 @@ class _Loop:
         ) -> tuple[Any, ...]:
             j = (before + t + n - 1) % n
             rng = step_rng(key, t)
-            # Not bits[j]: for that, XLA would compile again for each number of steps before the episode.
+            # With bits[j], XLA would compile again for each number of steps before the episode.
             random_bits, action_bits = tf.gather(bits, j), tf.gather(bits, n + j)
             state, new_reward, terminated, fault = self._step(state, epsilon, random_bits, action_bits, rng)
             is_over = terminated | (t + 1 >= most_steps) | (fault > 0)
@@ -343,7 +343,7 @@ class _Loop:
         return (next_state, next_observation), reward, terminated, fault
 
     def _epsilon(self, epsilon: tf.Tensor) -> tf.Tensor:
-        """Returns `policy.epsilon_at` of the step that comes next."""
+        """Returns `policy.epsilon_at` of the next step."""
         step = self._num_appended
         if self._config.epsilon_steps is not None:
             first, lowest, num_steps = tf.unstack(self._numbers.line)
@@ -376,7 +376,7 @@ class _Loop:
         return checked_step(batch, self._learner, self._numbers.gamma, self._tau(), self._formulas)
 
     def _tau(self) -> tf.Tensor:
-        """Returns the share of Q in the next change of Q-hat: 0 if none is due."""
+        """Returns the share of Q in the next update of Q-hat; 0 if no update is due."""
         if self._config.gradient_steps_per_target == 1:
             return self._numbers.tau
         num_updates = self._num_updates.assign_add(1, read_value=True)

@@ -1,4 +1,4 @@
-"""The random draws of compiled episodes. They depend only on the run's seed, the episode and the turn."""
+"""The random draws of compiled episodes, which depend only on the run's seed, the episode and the turn."""
 
 from typing import Any
 
@@ -27,9 +27,9 @@ def to_integer(bits: tf.Tensor, bound: Any) -> tf.Tensor:
 def sample_indices(bits: tf.Tensor, key: tf.Tensor, counter: Any, size: Any, memory_size: int) -> tf.Tensor:
     """Draws as many different indices in [0, size) as there are bits, uniformly; `size` is at most `memory_size`.
 
-    Repeats are drawn again, unless the batch is a large part of the memory: a batch of the whole memory would need as
-    many attempts as it has indices. For a small batch that does little harm in a run's first updates, when a large
-    memory is nearly empty.
+    Repeats are drawn again. That takes many attempts if the batch is a large part of the memory, so in this case the
+    indices are sorted by random bits instead. The exception is a small batch in a run's first updates, when a large
+    memory is nearly empty: it is drawn again, which costs little.
     """
     batch_size = bits.shape[0]
     if 4 * batch_size > memory_size:
@@ -83,7 +83,7 @@ def further_draws(counter: tf.Tensor, k: tf.Tensor) -> tf.Tensor:
     return tf.cast(counter, tf.int64) + k * _NEXT_GRADIENT_STEP
 
 
-_NEXT_GRADIENT_STEP = 2**44  # larger than that of any attempt
+_NEXT_GRADIENT_STEP = 2**44  # larger than the counter of any attempt
 
 
 def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:
@@ -91,7 +91,7 @@ def episode_key(key: tf.Tensor, episode: tf.Tensor) -> tf.Tensor:
     return tf.bitcast(draw_bits(2, key, episode), tf.int64)
 
 
-# The environment's own draws use negative counters, which no turn has.
+# The environment's own draws use negative counters, which turns never have.
 
 
 def reset_rng(key: tf.Tensor) -> tf.Tensor:

@@ -18,7 +18,7 @@ from dqn_keras.seeding import evaluation_key
 def greedy_returns(
     env: FuncEnv, spaces: Spaces, q_network: keras.Model, num_episodes: int, seed: int, max_steps: int
 ) -> np.ndarray:
-    """Plays greedy episodes and returns each one's undiscounted return, [num_episodes] float64."""
+    """Plays greedy episodes and returns the undiscounted return of each, [num_episodes] float64."""
 
     def make_program(actor: Actor, _: Any) -> Callable:
         def play(key: tf.Tensor, max_steps: tf.Tensor) -> tuple[tf.Tensor, tf.Tensor]:
@@ -55,7 +55,7 @@ def greedy_returns(
 def _play_episode(
     env: FuncEnv, spaces: Spaces, actor: Actor, key: tf.Tensor, max_steps: tf.Tensor
 ) -> tuple[tf.Tensor, tf.Tensor, tf.Tensor]:
-    """Plays an episode -> its return, its number of steps, whether all was finite."""
+    """Plays an episode -> its return, its number of steps, whether all numbers were finite."""
 
     def observe(state: Any, rng: tf.Tensor) -> tf.Tensor:
         return tf.cast(env.observation(state, rng), spaces.state_dtype)

@@ -1,7 +1,7 @@
-"""Episodes in any gymnasium.Env with Box observations and discrete actions, one step at a time.
+"""Plays any gymnasium.Env with Box observations and Discrete actions, one step at a time.
 
 A TensorFlow call costs more than a step of CartPole and the forward pass of its network together. Therefore the loop
-makes few of them: acting runs in NumPy if NumPy can compute the network, and each update is one compiled call.
+makes few such calls: acting runs in NumPy if NumPy can compute the network, and each update is one compiled call.
 """
 
 import math
@@ -73,7 +73,7 @@ def _play_episode(env: CheckedEnv, agent: Agent, config: Config, q: "_InNumPy | 
 
 
 def _update(agent: Agent, config: Config, q: "_InNumPy | _InTensorFlow") -> Metrics:
-    """Takes one gradient step on a batch from the memory; Q-hat moves only if it is due."""
+    """Takes one gradient step on a batch from the memory; updates Q-hat only if that is due."""
     agent.num_updates += 1
     is_due = agent.num_updates % config.gradient_steps_per_target == 0
     return q.update(agent.memory.sample_rows(config.batch_size, agent.rng), config.tau if is_due else 0.0)
@@ -91,7 +91,7 @@ class _InNumPy:
         self._as_tensor = tensor_maker()
 
     def read_weights(self) -> None:
-        """Reads the weights at the start of each episode, since a callback may have changed them."""
+        """Reads the weights at the start of each episode, because a callback may have changed them."""
         self._weights = self._network.get_weights()
 
     def values(self, state: np.ndarray) -> np.ndarray:
@@ -137,7 +137,7 @@ def _bind_step(
     """Returns the gradient step: rows of the memory -> a vector of its metrics and, if wanted, Q's new weights.
 
     It also takes tau, which is `config.tau` or 0. The compiled step has only two inputs and one output, because each
-    additional array costs as much as its share of the arithmetic.
+    additional array costs time.
     """
     rows, state_shape = agent.memory.rows, agent.memory.state_shape
 

@@ -1,4 +1,4 @@
-"""An update in either loop: a gradient step, checked to leave only finite weights, and the means over an episode."""
+"""Updates in both loops: a gradient step with a check for finite weights, and the means over an episode."""
 
 import math
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ def checked_step(experiences: Experience, learner: Learner, gamma: Any, tau: Any
 
 
 def num_before_updates(config: Config) -> int:
-    """Returns the number of transitions of a run from which on it updates."""
+    """Returns the number of transitions that a run must have before it updates."""
     return max(config.batch_size, config.learning_starts + 1)
 
 

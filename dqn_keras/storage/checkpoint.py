@@ -1,7 +1,7 @@
 """Checkpoints: the whole state of a run on disk.
 
 A checkpoint is a NumPy archive (.npz, only arrays, nothing is pickled) followed by the SHA-256 of its bytes. It is
-written under another name, flushed to the disk and only then renamed, so that a crash leaves the last one whole.
+written under another name, flushed to the disk and only then renamed, so that a crash leaves the previous one whole.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ from dqn_keras.storage.versions import warn_of_other_versions
 
 
 class Checkpoints:
-    """The checkpoints of one run in their own folder, one file each. Only the last two are kept."""
+    """Saves and restores the checkpoints of one run, one file each, in a folder. Only the last two are kept."""
 
     def __init__(
         self,
@@ -51,11 +51,10 @@ class Checkpoints:
         return sorted(self.folder.glob(f"checkpoint-{'[0-9]' * 10}.npz"), reverse=True)
 
     def begin(self, agent: Agent, seed: int | None, resume: bool) -> Path | None:
-        """Resumes the saved run, or saves a new one before any work starts; returns the file that was read, if any."""
+        """Restores the saved run, or saves a new one before any work starts; returns the file that was read, if any."""
         if not resume and (paths := self.paths()):
             raise ValueError(
-                f"checkpoint {paths[0]} is there already; resume=True continues that run, "
-                "a new run needs another folder"
+                f"checkpoint {paths[0]} exists already; resume=True continues that run, a new run needs another folder"
             )
         path = self.restore(agent, seed) if resume else None
         if path is None:
@@ -67,17 +66,17 @@ class Checkpoints:
         return path
 
     def save_when_due(self, agent: Agent) -> None:
-        """Saves if at least `every` episodes have passed since the last time; warns if the disk cannot be written."""
+        """Saves if at least `every` episodes have passed since the last save; warns if the disk cannot be written."""
         if len(agent.episodes) >= self._saved_at + self._every:
             self._save_or_warn(agent)
 
     def save_the_end(self, agent: Agent, may_have_changed: bool = False) -> None:
-        """Saves if episodes have passed since the last time, or if callbacks may have changed the agent."""
+        """Saves if episodes have passed since the last save, or if callbacks may have changed the agent."""
         if may_have_changed or len(agent.episodes) > self._saved_at:
             self._save_or_warn(agent)
 
     def _save_or_warn(self, agent: Agent) -> None:
-        """Saves; if that fails, warns once until it succeeds again."""
+        """Saves; warns at the first of several failures in a row."""
         self._saved_at = len(agent.episodes)
         try:
             self.save(agent)
@@ -110,7 +109,7 @@ class Checkpoints:
         del self._kept[2:]
 
     def restore(self, agent: Agent, seed: int | None) -> Path | None:
-        """Puts `agent` into the newest whole state and returns its file; None if there is no file yet.
+        """Restores `agent` from the newest whole checkpoint and returns its file; returns None if there is none yet.
 
         Raises:
             ValueError: the state is from another run (the message begins with what differs, such as a field of Config),
@@ -129,7 +128,7 @@ class Checkpoints:
             num_episodes = self._identity["config"]["num_episodes"]
             if num_episodes < len(agent.episodes):
                 raise ValueError(
-                    f"num_episodes must be at least {len(agent.episodes)}, as many as {path} has, got {num_episodes}"
+                    f"num_episodes must be at least {len(agent.episodes)}, the number in {path}, got {num_episodes}"
                 )
             if damaged:
                 warnings.warn(f"{'; '.join(damaged)}. The run continues from the older {path}", stacklevel=4)
@@ -143,7 +142,7 @@ class Checkpoints:
         return None
 
     def _is_of_this_run(self, path: Path, facts: dict[str, Any]) -> bool:
-        """Returns whether an older file is an earlier state of the run with these facts, so that it may be deleted."""
+        """Returns whether an older file is from the run with these facts, so that it may be deleted."""
         try:
             _, theirs = from_bytes(path.read_bytes())
             check_is_same(path, theirs, {**self._identity, "seed": facts["seed"]}, MAY_CHANGE_ON_RESUME)
@@ -188,7 +187,7 @@ def check_facts(facts: dict[str, Any], expected: dict[str, Any]) -> None:
 
 
 def _restore(agent: Agent, others: Sequence[tf.Variable], arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
-    """Puts a new agent into a saved state; raises DamagedError, before any change, if the state does not fit."""
+    """Restores a new agent to a saved state; if the state does not fit, raises DamagedError before any change."""
     episodes_played, num_appended, epsilon = facts["episodes_played"], facts["num_appended"], facts["epsilon"]
     rng = np.random.default_rng(0)
     try:
@@ -198,7 +197,7 @@ def _restore(agent: Agent, others: Sequence[tf.Variable], arrays: dict[str, np.n
     expected = _arrays(agent, others)
     expected |= {f"episodes/{name}": np.zeros(max(0, episodes_played), dtype) for name, dtype in _COLUMNS.items()}
     expected["memory"] = agent.memory.rows[:num_appended]
-    # A run continues if one of Adam's averages overflows, as long as the weights are finite.
+    # Adam's averages may overflow: a run continues as long as the weights are finite.
     may_be_infinite = {f"episodes/{name}" for name in (*Metrics._fields, "reward")} | {
         name for name in expected if name.startswith(("optimizer/", "other/"))
     }
@@ -216,7 +215,7 @@ def _restore(agent: Agent, others: Sequence[tf.Variable], arrays: dict[str, np.n
     if not np.isfinite(arrays["episodes/reward"][:-1]).all():
         raise DamagedError("episodes/reward holds a number that is not finite")
     if arrays["episodes/steps"].sum() != num_appended or not 0 <= epsilon <= 1:
-        raise DamagedError("its counts do not belong together")
+        raise DamagedError("its counts contradict each other")
 
     columns = (arrays[f"episodes/{name}"].tolist() for name in _COLUMNS)
     agent.episodes[:] = [Episode(k, *values) for k, values in enumerate(zip(*columns, strict=True))]

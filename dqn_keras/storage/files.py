@@ -1,4 +1,4 @@
-"""Files that are either whole or absent: they replace the old file at once, and a digest is checked on reading."""
+"""Files that are written whole or not at all, and whose SHA-256 is checked when they are read."""
 
 import contextlib
 import hashlib
@@ -20,7 +20,7 @@ FORMAT = 6
 
 
 class DamagedError(ValueError):
-    """The reason why a file is not a whole checkpoint."""
+    """The error for a file that is not a whole checkpoint."""
 
 
 def to_bytes(arrays: Mapping[str, Any], facts: dict[str, Any]) -> bytes:
@@ -35,7 +35,7 @@ def from_bytes(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Returns the arrays and facts in `content`; raises DamagedError if it is damaged or has another format."""
     body, digest = content[:-32], content[-32:]
     if hashlib.sha256(body).digest() != digest:
-        raise DamagedError("its SHA-256 is not that of its content, so that it has been cut short or changed")
+        raise DamagedError("its SHA-256 does not match its content: it was cut short or changed")
     try:
         with zipfile.ZipFile(io.BytesIO(body)) as archive:
             if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
@@ -46,12 +46,12 @@ def from_bytes(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except (KeyError, TypeError, ValueError, OSError, RecursionError, zipfile.BadZipFile) as error:
         raise DamagedError(f"it is not a checkpoint ({error})") from None
     if file_format != FORMAT:
-        raise DamagedError(f"its format is {file_format!r}, and dqn_keras {__version__} reads {FORMAT}")
+        raise DamagedError(f"its format is {file_format!r}, but dqn_keras {__version__} reads {FORMAT}")
     return arrays, facts
 
 
 def _read_array(content: bytes) -> np.ndarray:
-    """Returns the array in the content of an .npy file, once its header is found to fit its size."""
+    """Returns the array in the content of an .npy file; raises ValueError if its header does not fit its size."""
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -63,7 +63,7 @@ def _read_array(content: bytes) -> np.ndarray:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a temporary path beside `path`; its file replaces `path` at once when the block ends without an error."""
+    """Yields a temporary path, whose file replaces `path` in one step when the block ends without an error."""
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         yield temporary
@@ -74,7 +74,7 @@ def replacing(path: Path) -> Iterator[Path]:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
-    if os.name == "posix":  # flushes the folder's list of names, too
+    if os.name == "posix":  # also flushes the folder's list of names
         descriptor = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(descriptor)
@@ -84,14 +84,14 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def locked(path: Path, what: str) -> Iterator[None]:
-    """Makes a lock file, and its folder, and holds it while the block runs.
+    """Holds a lock file while the block runs; makes the file and its folder if necessary.
 
-    The system releases the lock of a process that dies. In a folder that cannot be written, there is no lock, and
+    The system releases the lock of a process that dies. A folder that cannot be written gets no lock, because there is
     nothing to protect.
 
     Raises:
-        ValueError: somebody else holds the lock; the message begins with `what`.
-        OSError: the folder can be written, but not the lock file: it may belong to another user.
+        ValueError: another process or thread holds the lock; the message begins with `what`.
+        OSError: the folder can be written, but not the lock file, which may belong to another user.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

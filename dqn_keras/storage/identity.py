@@ -1,4 +1,4 @@
-"""The identity of a run: what must be equal for two runs to be the same, in a form that a file can hold."""
+"""The identity of a run: everything that must be equal for two runs to be the same, in a form for a file."""
 
 import dataclasses
 import json
@@ -21,7 +21,7 @@ from dqn_keras.storage.versions import versions
 
 
 class Identity(NamedTuple):
-    """What must be the same for a saved run to be resumed."""
+    """Everything that must be the same when a saved run is resumed."""
 
     facts: dict[str, Any]
     """The identity as JSON values."""
@@ -37,7 +37,7 @@ def identity(
     q_network: keras.Model | None = None,
     optimizer: keras.Optimizer | None = None,
 ) -> Identity:
-    """Returns what must be the same for a saved run to be resumed; versions may differ.
+    """Returns everything that must be the same when a saved run is resumed; only versions may differ.
 
     Args:
         env: the environment.
@@ -141,7 +141,7 @@ def check_is_same(
             if saved.computes != here.computes:
                 raise ValueError(
                     f"{name} is {saved.words!r} in {path}, got one of that name that computes something else: "
-                    "its code, or something that it reads, has changed"
+                    "its code, or a value that it reads, has changed"
                 )
         elif saved.source != here.source:
             raise ValueError(f"{name} is {saved.words!r} in {path}, got one of that name with another source")

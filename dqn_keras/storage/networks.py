@@ -1,4 +1,4 @@
-"""Files with only the trained network, in Keras' own format."""
+"""Files that hold only the trained network, in Keras' own format."""
 
 import os
 import zipfile
@@ -14,7 +14,7 @@ from dqn_keras.storage.files import replacing
 
 
 def save_q_network(path: str | os.PathLike, q_network: keras.Model) -> None:
-    """Saves only the network, in Keras' own format; an older file of that name is replaced at once.
+    """Saves only the network, in Keras' own format; replaces an older file in one step.
 
     Raises:
         ValueError: `path` does not end in .keras, or the network has a layer of an unregistered class.
@@ -28,8 +28,8 @@ def save_q_network(path: str | os.PathLike, q_network: keras.Model) -> None:
             network = type(q_network).from_config(q_network.get_config())  # without the optimizer
     except (TypeError, ValueError) as error:
         raise ValueError(
-            "q_network has a layer that no file can name: keras.saving.register_keras_serializable() on its class, and "
-            f"get_config in it, make it one ({error})"
+            "q_network has a layer that cannot be saved: decorate its class with "
+            f"keras.saving.register_keras_serializable(), and define get_config in it ({error})"
         ) from error
     network.set_weights(q_network.get_weights())
     finalize_layers(network)
@@ -40,7 +40,7 @@ def save_q_network(path: str | os.PathLike, q_network: keras.Model) -> None:
 
 
 def _check_weights(group: h5py.Group) -> None:
-    """Raises ValueError if an array is a link, or larger than what the file holds of it."""
+    """Raises ValueError if an array is a link, or larger than its data in the file."""
     for name in group:
         is_here = isinstance(group.get(name, getlink=True), h5py.HardLink)
         if is_here and isinstance(group[name], h5py.Group):
@@ -52,7 +52,7 @@ def _check_weights(group: h5py.Group) -> None:
 def load_q_network(path: str | os.PathLike) -> keras.Model:
     """Returns the network saved by `run.save`, for `evaluate` or any other use of a Keras model.
 
-    The file is read in Keras' safe mode, which refuses a file that would run its own code.
+    The file is read in Keras' safe mode, which rejects files that would run their own code.
 
     Raises:
         FileNotFoundError: the file does not exist.

@@ -1,4 +1,4 @@
-"""Descriptions of the parts of a run: the name, the source of the user's code, and the computation."""
+"""Descriptions of the parts of a run: name, source of the user's code, and computation."""
 
 import functools
 import hashlib
@@ -27,11 +27,11 @@ class Part(NamedTuple):
     source: str = ""
     """Digest of the source of the user's code in the part."""
     computes: str = ""
-    """Digest of the traced graph, different for parts that compute different things; empty if there is none."""
+    """Digest of the traced graph, which differs if parts compute different things; empty if there is no graph."""
 
 
 def words_for(part: Any) -> str:
-    """Returns the name of a network, an optimizer or a formula, with the settings that are not defaults."""
+    """Returns the name of a network, an optimizer or a formula, and the settings that differ from the defaults."""
     if part is None:
         return "the default"
     if isinstance(part, str):
@@ -71,7 +71,7 @@ def source_of(part: Any) -> str:
 
 
 def check_can_be_imported(argument: str, part: Any) -> None:
-    """Raises ValueError if a function or class of the user has no name by which it can be imported."""
+    """Raises ValueError if a function or class of the user cannot be imported by its name."""
     for code in _own_code(part, set()):
         try:
             is_importable = operator.attrgetter(code.__qualname__)(sys.modules[code.__module__]) is code
@@ -79,7 +79,7 @@ def check_can_be_imported(argument: str, part: Any) -> None:
             is_importable = False
         if not is_importable:
             raise ValueError(
-                f"{argument} must have a name that can be imported, since the checkpoint keeps it; "
+                f"{argument} must have a name that can be imported, because the checkpoint keeps it; "
                 f"{code.__module__}.{code.__qualname__} has none: "
                 "define it with `def` or `class` at the top level of a module, a script or a notebook"
             )
@@ -128,8 +128,8 @@ _MAY_BE_OWN = (
 def describe(env: gym.Env | FuncEnv) -> tuple[Part, *tuple[Computation, ...]]:
     """Returns what identifies an environment: a Part and, if it is functional, its Computation.
 
-    A registered environment is described by its id and arguments, any other by those arguments of its constructor that
-    it keeps as attributes of the same name. `render_mode` is left out.
+    A registered environment is described by its id and arguments, any other by the constructor arguments that it keeps
+    as attributes of the same name. `render_mode` is left out.
     """
     wrappers: list[Any] = []
     if isinstance(env, FuncEnv):

@@ -1,4 +1,4 @@
-"""The file of a study or a sweep: the outcome of each seed of each setting; nothing in it is taken on trust."""
+"""The file of a study or a sweep: the outcome of each seed of each setting, checked when it is read."""
 
 import contextlib
 import time
@@ -24,15 +24,15 @@ Outcomes = dict[Task, Outcome]
 def kept_in(
     path: Path | None, settings: Mapping[str, dict[str, Any]], tasks: Sequence[Task]
 ) -> Iterator[tuple[Outcomes, Callable[[], None]]]:
-    """Yields the outcomes in the file, and a function that saves them when it is time; saves at the end.
+    """Yields the outcomes in the file, and a function that saves them when a save is due; also saves at the end.
 
-    Nobody else can write the file meanwhile. If it cannot be written, that is an error at the start, and a warning
-    later.
+    No other process can write the file meanwhile. If the file cannot be written, OSError is raised at the start; later
+    there is only a warning.
 
     Args:
-        path: the file; None keeps nothing.
+        path: the file; None saves nothing.
         settings: the identity of each setting, by its name.
-        tasks: the outcomes that are wanted.
+        tasks: the tasks whose outcomes are wanted.
     """
     if path is None:
         yield {}, lambda: None
@@ -49,7 +49,8 @@ def kept_in(
             check_is_same(label, theirs[name], settings[name])
             warn_of_other_versions(label, theirs[name], settings[name], stacklevel=5)
         if theirs and "" in theirs.keys() ^ settings.keys():
-            raise ValueError(f"file {path} holds a {'study' if '' in theirs else 'sweep'}, and this is another kind")
+            kinds = ("study", "sweep") if "" in theirs else ("sweep", "study")
+            raise ValueError(f"file {path} holds a {kinds[0]}, and cannot be used for a {kinds[1]}")
         settings = {**theirs, **settings}
         if any(task not in outcomes for task in tasks):
             try:
@@ -96,7 +97,7 @@ def read(path: Path) -> tuple[dict[str, Config], Outcomes]:
     """Returns the parameters of each setting, by its name, and all outcomes.
 
     Raises:
-        ValueError: the file is damaged, or something in it cannot be from a study; the message names the file.
+        ValueError: the file is damaged or was not written by `study` or `sweep`; the message names the file.
     """
     outcomes, settings = _read("path", path)
     return {name: _config(facts) for name, facts in settings.items()}, outcomes
@@ -111,12 +112,12 @@ def _read(argument: str, path: Path) -> tuple[Outcomes, dict[str, dict[str, Any]
         for i, setting in enumerate(facts["settings"]):
             name, config = setting["name"], _config(setting)
             if not isinstance(name, str) or name in settings:
-                raise ValueError(f"setting {name!r} is no name, or in it twice")
+                raise ValueError(f"setting {name!r} is not a name, or occurs twice")
             settings[name] = {key: value for key, value in setting.items() if key not in ("name", "seeds")}
             for seed, solved_at, greedy_return, seconds, digest in setting["seeds"]:
                 task = Task(name, check_count("seeds", seed, at_least=0))
                 if task in outcomes:
-                    raise ValueError(f"seed {seed} is in it twice")
+                    raise ValueError(f"seed {seed} occurs twice")
                 arrays = columns[f"{i}/{seed}/rewards"], columns[f"{i}/{seed}/steps"]
                 digest = bytes.fromhex(digest)
                 outcomes[task] = Outcome(seed, *arrays, solved_at, float(greedy_return), float(seconds), digest)
@@ -146,4 +147,4 @@ def _check_outcome(outcome: Outcome, config: Config) -> None:
         and seconds >= 0
     )
     if not is_right:
-        raise ValueError(f"the episodes of seed {seed} are not as `study` records them")
+        raise ValueError(f"the episodes of seed {seed} are not what `study` records")

@@ -21,11 +21,11 @@ def versions() -> dict[str, str]:
 
 
 def warn_of_other_versions(path: Path | str, theirs: dict[str, Any], ours: dict[str, Any], stacklevel: int) -> None:
-    """Gives one warning that names all versions that differ."""
+    """Warns once, naming all versions that differ."""
     theirs, ours = theirs["versions"], ours["versions"]
     others = [f"{name} {theirs.get(name)} (here {ours[name]})" for name in ours if theirs.get(name) != ours[name]]
     if others:
         warnings.warn(
-            f"{path} was saved with {', '.join(others)}: what is added may differ in its last bits",
+            f"{path} was saved with {', '.join(others)}: new results may differ in their last bits",
             stacklevel=stacklevel,
         )

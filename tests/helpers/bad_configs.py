@@ -1,4 +1,4 @@
-"""Values that no field of Config takes."""
+"""Values that no field of Config accepts."""
 
 import numpy as np
 import pytest

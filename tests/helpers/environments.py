@@ -1,11 +1,11 @@
-"""Small environments to try the loop on."""
+"""Small environments for tests of the loop."""
 
 import gymnasium as gym
 import numpy as np
 
 
 class Corridor(gym.Env):
-    """Walk right from 0 to the end; every step gives 1, the end terminates. Keyword arguments replace its parts."""
+    """Walks right from 0 to the end; every step gives 1, the end terminates. Keyword arguments replace its parts."""
 
     def __init__(
         self, length=5, limit=None, action_space=None, observation_space=None, observe=None, reward=None, end=None
@@ -34,14 +34,14 @@ class Corridor(gym.Env):
 
 
 class OldReset(Corridor):
-    """Its `reset` returns no info."""
+    """Returns no info from `reset`."""
 
     def reset(self, *, seed=None, options=None):
         return super().reset(seed=seed)[0]
 
 
 class OldStep(Corridor):
-    """Its `step` returns `done`, as Gym's did."""
+    """Returns `done` from `step`, as in old versions of Gym."""
 
     def step(self, action):
         observation, reward, terminated, _, info = super().step(action)

@@ -1,4 +1,4 @@
-"""Faults done to training on purpose, by tests at a small size and by `benchmarks.reliability` at the full one."""
+"""Makes faults during training on purpose: in tests at a small size, in `benchmarks.reliability` at full size."""
 
 import contextlib
 import dataclasses
@@ -32,18 +32,18 @@ from dqn_keras.storage.identity import identity
 from tests.helpers.runs import fingerprint
 
 LOOPS = {"Gymnasium loop": lambda: gym.make("CartPole-v1"), "compiled episodes": CartPole}
-CONFIG = Config(num_episodes=250, batch_size=32, memory_size=2_000, solved_reward=1e6)  # its memory goes round
+CONFIG = Config(num_episodes=250, batch_size=32, memory_size=2_000, solved_reward=1e6)  # its memory overflows
 SEED, EVERY = 3, 5
 
 
 def half_targets(experiences, gamma, q_network, q_hat_network):
-    """Targets of the user's own: a mean of Q and Q-hat."""
+    """Returns own targets: a mean of Q and Q-hat."""
     values = (q_network(experiences.next_state) + q_hat_network(experiences.next_state)) / 2
     return experiences.reward + (1 - experiences.terminal_state) * gamma * tf.reduce_max(values, axis=-1)
 
 
 class RunningScale(keras.losses.Loss):
-    """A loss of the user's own, with a variable that is part of the run's state."""
+    """Returns an own loss, with a variable that is part of the run's state."""
 
     def __init__(self):
         super().__init__()
@@ -75,7 +75,7 @@ def _scheduled():
     return keras.optimizers.Adam(keras.optimizers.schedules.ExponentialDecay(0.003, 100, 0.9), clipnorm=1.0)
 
 
-OWN_PARTS = {  # a case is the name of its loop and what it is
+OWN_PARTS = {  # a case has the name of its loop, and of its parts
     ("Gymnasium loop", "convolution, schedule"): lambda: {"q_network": _convolution(), "optimizer": _scheduled()},
     ("compiled episodes", "convolution, own loss"): lambda: {"q_network": _convolution(), "loss": RunningScale()},
     ("Gymnasium loop", "LSTM, own targets"): lambda: {"q_network": _lstm(), "targets": half_targets},
@@ -89,7 +89,7 @@ OWN_PARTS = {  # a case is the name of its loop and what it is
 
 
 def play(case, folder, config=CONFIG, seed=SEED, env=None, resume=True, **arguments):
-    """A run of the campaign, or what is left of it; a case is the name of a loop, or one of OWN_PARTS."""
+    """Trains or resumes a run of the campaign; a case is the name of a loop, or one of OWN_PARTS."""
     if case in OWN_PARTS:
         keras.utils.set_random_seed(0)  # the weights that the network starts with
         config, arguments = dataclasses.replace(config, num_episodes=100), OWN_PARTS[case]()
@@ -104,16 +104,16 @@ def newest(folder):
 
 
 def files(folder):
-    """The names of the files of a run, without the lock, which stays."""
+    """Returns the names of the files of a run, except the lock file, which always stays."""
     return sorted({path.name for path in Path(folder).iterdir()} - {".lock"})
 
 
 def final_bits(folder):
-    """Of weights, target, Adam, memory, random state, rewards and counters: the digest of the last checkpoint."""
+    """Returns the digest of the last checkpoint: of weights, Adam, memory, random state, rewards and counters."""
     return hashlib.sha256(newest(folder).read_bytes()).hexdigest()
 
 
-# Kills. A child process trains; it dies by SIGKILL, from outside at a random time or by its own hand inside a save.
+# Kills. A child process trains; SIGKILL ends it, at a random time or in the middle of a save.
 
 
 def _train_in_child(case, folder, started, death):
@@ -124,7 +124,7 @@ def _train_in_child(case, folder, started, death):
 
 
 def _die_in_save(num_saves, num_lines, share):
-    """Die in the save after `num_saves`: before its line `num_lines`, or, if there is a share, in mid-write."""
+    """Kills this process in the save after `num_saves`: before its line `num_lines` or, with a share, in mid-write."""
     saves, save = iter(range(num_saves + 1)), Checkpoints.save
 
     def tracer(frame, event, _):
@@ -157,7 +157,7 @@ def _die_in_save(num_saves, num_lines, share):
 
 
 def child_process(target, *arguments):
-    """A process that has imported the package already, and nothing more."""
+    """Starts a process that has imported the package and done nothing else."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["dqn_keras", "tests.helpers.faults"])
     started = context.Event()
@@ -168,7 +168,7 @@ def child_process(target, *arguments):
 
 
 def kill_campaign(folder, num_kills, num_in_saves, kills_per_run=10, seed=0, cases=tuple(LOOPS)):
-    """SIGKILL runs of these cases again and again, each time resumed: -> kills done, in saves, runs, differing runs.
+    """Kills runs of these cases again and again, resuming them each time -> kills done, in saves, runs, differing runs.
 
     `num_in_saves` of the deaths, or a few more, are inside a save. After each the newest checkpoint must be whole.
     """
@@ -199,7 +199,7 @@ def kill_campaign(folder, num_kills, num_in_saves, kills_per_run=10, seed=0, cas
                 process.join(rng.uniform(0, seconds[case]))
                 process.kill()
             process.join()
-            if process.exitcode == 0:  # it was done before
+            if process.exitcode == 0:  # it finished before the kill
                 seconds[case] = min(seconds[case], time.perf_counter() - start)
                 break
             assert process.exitcode == -signal.SIGKILL, process.exitcode
@@ -217,33 +217,33 @@ def kill_campaign(folder, num_kills, num_in_saves, kills_per_run=10, seed=0, cas
     return {"kills": killed, "of them inside a save": killed_in_saves, "runs": runs, "differing runs": differing}
 
 
-# Corruption. The newest of two checkpoints is spoilt; what is loaded must be the older one, and that must be said.
+# Corruption. The newest of two checkpoints is damaged. The older one must be loaded, with a warning.
 
 
-def spoilt(content, rng):
-    """The bytes of a checkpoint spoilt in one way: -> the way, the new bytes."""
+def corrupted(content, rng):
+    """Corrupts the bytes of a checkpoint in one way -> the way, the new bytes."""
     way = rng.choice(["bit flip", "bit flip in the zip's directory", "truncation", "tail", "swapped members", "zeros"])
-    spoilt = bytearray(content)
+    changed = bytearray(content)
     if way == "bit flip":
-        spoilt[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+        changed[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
     elif way == "bit flip in the zip's directory":
         start = content.index(b"PK\x01\x02")
-        spoilt[rng.randrange(start, len(content))] ^= 1 << rng.randrange(8)
+        changed[rng.randrange(start, len(content))] ^= 1 << rng.randrange(8)
     elif way == "truncation":
-        del spoilt[rng.randrange(len(content)) :]
+        del changed[rng.randrange(len(content)) :]
     elif way == "tail":
-        spoilt += rng.randbytes(rng.randrange(1, 100))
+        changed += rng.randbytes(rng.randrange(1, 100))
     elif way == "swapped members":
         names = rng.choice([(b"q_network/1", b"q_hat_network/1"), (b"optimizer/2", b"optimizer/4")])
-        spoilt = spoilt.replace(names[0], b"\0").replace(names[1], names[0]).replace(b"\0", names[1])
+        changed = changed.replace(names[0], b"\0").replace(names[1], names[0]).replace(b"\0", names[1])
     else:
         start = rng.randrange(len(content) - 32)
-        spoilt[start : start + 32] = bytes(32)
-    return way, bytes(spoilt)
+        changed[start : start + 32] = bytes(32)
+    return way, bytes(changed)
 
 
 def forged(content, rng):
-    """A checkpoint made wrong with a right digest: -> the way, the new bytes."""
+    """Changes a checkpoint and gives it the right digest -> the way, the new bytes."""
     arrays, facts = from_bytes(content)
     name = rng.choice(sorted(arrays))
     way = rng.choice(["format", "shape", "dtype", "NaN", "missing array", "array too many", "missing fact", "counts"])
@@ -269,7 +269,7 @@ def forged(content, rng):
 
 
 def corruption_campaign(folder, number, seed=0):
-    """-> how often each way was tried, and how often it was not noticed, or not said, or not made good."""
+    """Corrupts checkpoints -> how often each way was tried, and how often it had no warning or a wrong result."""
     rng, folder = random.Random(seed), Path(folder)
     env, config = CartPole(), CONFIG
     source = folder / "source"
@@ -279,28 +279,32 @@ def corruption_campaign(folder, number, seed=0):
     tried, silent = {}, []
     agent = make_agent((4,), 2, config, SEED)
     for _ in range(number):
-        way, content = (spoilt if rng.random() < 0.8 else forged)(good, rng)
+        way, content = (corrupted if rng.random() < 0.8 else forged)(good, rng)
         if content == good:
-            continue  # zeros where there were zeros
+            continue  # zeros replaced by zeros
         tried[way] = tried.get(way, 0) + 1
         newest(source).write_bytes(content)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             path = Checkpoints(source, identity(env, config, agent)).restore(agent, SEED)
-        said = [str(w.message) for w in caught]
-        is_told = len(said) == 1 and str(newest(source)) in said[0] and f"continues from the older {older}" in said[0]
+        messages = [str(w.message) for w in caught]
+        is_warned = (
+            len(messages) == 1
+            and str(newest(source)) in messages[0]
+            and f"continues from the older {older}" in messages[0]
+        )
         restored = checkpoint._arrays(agent, [])
         is_older = all(np.array_equal(restored[k], v, equal_nan=True) for k, v in expected.items())
-        if path != older or not is_told or not is_older:
-            silent.append((way, path, said))
+        if path != older or not is_warned or not is_older:
+            silent.append((way, path, messages))
     return {"corruptions": sum(tried.values()), "by way": tried, "silent": silent}
 
 
-# Forgotten fields. Each part of a checkpoint is taken away, or put back to what it is at the start, in turn.
+# Forgotten fields. Each part of a checkpoint in turn is left out, or reset to its value at the start.
 
 
 def forgetting_campaign(loop, folder):
-    """-> for each part, how a resume shows that it is missing, and that it is reset; '' if it does not."""
+    """Returns, for each part, how a resume shows that it is missing, and that it is reset; '' if it does not."""
     folder = Path(folder)
     run = play(loop, folder / "reference")
     reference = final_bits(folder / "reference")
@@ -313,17 +317,17 @@ def forgetting_campaign(loop, folder):
     start_facts["seed"] = 0
 
     def outcome(arrays, facts):
-        spoilt_folder = folder / "spoilt"
-        shutil.rmtree(spoilt_folder, ignore_errors=True)
-        spoilt_folder.mkdir()
-        (spoilt_folder / newest(folder / "half").name).write_bytes(to_bytes(arrays, facts))
+        changed_folder = folder / "changed"
+        shutil.rmtree(changed_folder, ignore_errors=True)
+        changed_folder.mkdir()
+        (changed_folder / newest(folder / "half").name).write_bytes(to_bytes(arrays, facts))
         try:
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
-                play(loop, spoilt_folder, seed=None)
+                play(loop, changed_folder, seed=None)
         except ValueError:
             return "refused"
-        if final_bits(spoilt_folder) != reference:
+        if final_bits(changed_folder) != reference:
             return "other bits"
         return "warned" if caught else ""
 
@@ -347,7 +351,7 @@ def forgetting_campaign(loop, folder):
 
 @contextlib.contextmanager
 def failing(module, name, error, after=0):
-    """From its call number `after` on, a function of a module raises."""
+    """Makes a function of a module raise an error from its call number `after` on."""
     original, calls = getattr(module, name), iter(range(10**9))
 
     def fails(*arguments, **keywords):
@@ -391,7 +395,7 @@ def _make_immutable(fault, folder):
     fault.callback(subprocess.run, ["chattr", "-i", folder], check=True)
 
 
-DISK_FAULTS = {  # each is begun in a run, and undone when its stack ends
+DISK_FAULTS = {  # each begins during a run, and ends with its stack
     "no space left on the device": _always(os, "fsync", OSError(errno.ENOSPC, "No space left on device")),
     "an input/output error": _always(Path, "write_bytes", OSError(errno.EIO, "Input/output error")),
     "a rename that fails": _always(os, "replace", PermissionError(errno.EACCES, "Permission denied")),
@@ -400,14 +404,14 @@ DISK_FAULTS = {  # each is begun in a run, and undone when its stack ends
     "a disk that is full": _fill,
     "a folder that is read-only": _make_immutable,
 }
-NEED_RIGHTS = {  # commands that show whether this process, and this system, can do it
+NEED_RIGHTS = {  # commands that show whether this process can do it on this system
     "a disk that is full": (["mount", "-t", "tmpfs", "tmpfs"], ["umount"]),
     "a folder that is read-only": (["chattr", "+i"], ["chattr", "-i"]),
 }
 
 
 def is_possible(name, folder):
-    """Whether this process may do this to a folder."""
+    """Returns whether this process may do this to a folder."""
     return all(
         shutil.which(words[0]) and subprocess.run([*words, folder], capture_output=True).returncode == 0
         for words in NEED_RIGHTS.get(name, ())
@@ -415,7 +419,7 @@ def is_possible(name, folder):
 
 
 def under_disk_fault(name, folder):
-    """Trains in a folder whose disk fails from episode 12 on, then resumes on the mended disk.
+    """Trains in a folder whose disk fails from episode 12 on, then resumes on the working disk.
 
     -> both runs, the warnings of checkpoints in the first, and the files that it left.
     """
@@ -436,15 +440,15 @@ def under_disk_fault(name, folder):
 
 
 def disk_campaign(folder):
-    """-> faults of the disk, those that were not one warning, files too many, runs that differ after a resume."""
+    """Counts faults of the disk, faults without exactly one warning, files too many, and runs that differ."""
     folder, figures = Path(folder), {"faults": 0, "not one warning": 0, "litter": 0, "differing runs": 0}
     for k, name in enumerate(DISK_FAULTS):
         (folder / str(k)).mkdir()
         if not is_possible(name, folder / str(k)):
             continue
-        run, resumed, said, left = under_disk_fault(name, folder / str(k))
+        run, resumed, messages, left = under_disk_fault(name, folder / str(k))
         figures["faults"] += 1
-        figures["not one warning"] += len(said) != 1
+        figures["not one warning"] += len(messages) != 1
         figures["litter"] += len(left) != 2
         figures["differing runs"] += fingerprint(resumed) != fingerprint(run)
     return figures
@@ -472,7 +476,7 @@ def try_to_train(loop, folder, started, report):
 
 
 def race_campaign(folder, number):
-    """Start two processes at once in one folder -> pairs, those refused, and runs that differ from one alone."""
+    """Starts two processes at once in one folder -> pairs, refused ones, runs that differ from a single process."""
     folder, figures = Path(folder), {"pairs": 0, "refused by the lock": 0, "differing runs": 0}
     play("Gymnasium loop", folder / "alone")
     for k in range(number):
@@ -481,16 +485,16 @@ def race_campaign(folder, number):
         ]
         for process in processes:
             process.join()
-        said = [(folder / f"{k} {i}").read_text() for i in range(2)]
+        messages = [(folder / f"{k} {i}").read_text() for i in range(2)]
         figures["pairs"] += 1
-        figures["refused by the lock"] += sum("is in use" in x for x in said)
-        is_whole = "trained" in said and final_bits(folder / str(k)) == final_bits(folder / "alone")
+        figures["refused by the lock"] += sum("is in use" in x for x in messages)
+        is_whole = "trained" in messages and final_bits(folder / str(k)) == final_bits(folder / "alone")
         figures["differing runs"] += not (is_whole and len(files(folder / str(k))) == 2)
     return figures
 
 
 def _after_first_checkpoint(folder):
-    """Wait for it, with which a run begins: -> the time."""
+    """Waits for the first checkpoint of a run -> the time."""
     start = time.perf_counter()
     while not list(folder.glob("checkpoint-*.npz")):
         if time.perf_counter() > start + 120:
@@ -500,7 +504,7 @@ def _after_first_checkpoint(folder):
 
 
 def signal_campaign(folder, number, seed=0):
-    """Ask runs to stop by SIGINT and SIGTERM at random times: -> requests, how many stopped a run, differing runs.
+    """Asks runs to stop by SIGINT and SIGTERM at random times: -> requests, how many stopped a run, differing runs.
 
     Those that stop none come when training has ended and its process has not.
     """

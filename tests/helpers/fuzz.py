@@ -1,4 +1,4 @@
-"""Every public function with one bad argument: which errors name it, which do not, and what is accepted.
+"""Calls every public function with one bad argument: which errors name it, which do not, and what is accepted.
 
 `DOORS` holds each function with arguments that are right, and for each argument a claim: which other values are right,
 too. `POOL` holds values that are wrong almost everywhere. `fuzz` puts values of the pool in place of the arguments.
@@ -65,7 +65,7 @@ def networks(seed: int = 0) -> tuple[keras.Model, keras.Model]:
 
 @functools.cache
 def shared() -> dict[str, Any]:
-    """What many calls can share, since only a call with right arguments changes it."""
+    """Returns what many calls can share, because only a call with right arguments changes it."""
     q_network, q_hat_network = networks()
     return {
         "q": q_network,
@@ -103,7 +103,7 @@ def functional(inputs: Any, outputs: Callable = lambda x: x) -> keras.Model:
 
 
 UNUSUAL = ("a network with a dictionary of inputs", "a network without weights")
-"""Networks that map states to Q-values, after all."""
+"""Networks that map states to Q-values, although they look wrong."""
 
 MODELS = {
     "an unbuilt network": lambda: keras.Sequential([keras.layers.Dense(2)]),
@@ -229,7 +229,7 @@ POOL: dict[str, Callable[[], Any]] = {
     "two Axes": lambda: plt.subplots(1, 2)[1],
     "a Figure": plt.figure,
 }
-"""Each value is made again, by name: a shared one could carry what an earlier case did to it."""
+"""The values by name. Each is made again for each case, because an earlier case could have changed it."""
 
 Claim = Callable[[Any], bool]
 """Returns whether a value, from `POOL`, is right, so that the function must accept it."""

@@ -1,4 +1,4 @@
-"""Many agents, runs and studies in one process: what they leave behind."""
+"""Measures what many agents, runs and studies leave behind in one process."""
 
 import gc
 import os
@@ -17,18 +17,18 @@ from dqn_keras import Config, learn, make_networks, study, train
 from dqn_keras.environments import CartPole
 
 TINY = Config(num_episodes=2, batch_size=4, max_steps=20, solved_window=1)
-WARM_UP = 40  # what the first ones compile and allocate stays
+WARM_UP = 40  # the memory that the first ones compile and allocate stays
 SHARED_MEMORY = Path("/dev/shm")
 
 
 def resident() -> float:
-    """Resident memory of this process in MB, without garbage."""
+    """Returns the resident memory of this process in MB, without garbage."""
     gc.collect()
     return psutil.Process().memory_info().rss / 1e6
 
 
 def held(folder: Path) -> dict[str, int]:
-    """The number of things other than memory that this process holds. `folder` has its temporary files and cache."""
+    """Counts what this process holds other than memory. `folder` has its temporary files and cache."""
     process, temporary = psutil.Process(), [x for x in folder.iterdir() if x.name != "cache"]
     return {
         "file descriptors": process.num_fds(),
@@ -59,24 +59,24 @@ def train_in_both_loops(seed: int) -> None:
 
 
 def study_here(seed: int) -> None:
-    """A study of two seeds in this process."""
+    """Makes a study of two seeds in this process."""
     study(CartPole(), TINY, [seed, seed + 1], num_workers=1, verbose=0)
 
 
 def study_in_workers(seed: int) -> None:
-    """A study of two seeds in two worker processes, which joblib keeps for the next one."""
+    """Makes a study of two seeds in two worker processes, which joblib keeps for the next study."""
     study(CartPole(), TINY, [seed, seed + 1], num_workers=2, verbose=0)
 
 
 def study_in_new_workers(num_studies: int) -> None:
-    """Studies in two worker processes, which end after the last one."""
+    """Makes studies in two worker processes, which end after the last study."""
     for seed in range(num_studies):
         study_in_workers(seed)
     get_reusable_executor().shutdown(wait=True)
 
 
 def growth(use: Callable[[int], None], number: int) -> float:
-    """The resident memory in MB that `number` uses add, after some for warming up."""
+    """Returns the resident memory in MB that `number` uses add, after some uses to warm up."""
     for seed in range(WARM_UP):
         use(seed)
     before = resident()
@@ -86,12 +86,12 @@ def growth(use: Callable[[int], None], number: int) -> float:
 
 
 def long_runs(num_agents: int, num_trains: int, num_studies: int, num_in_workers: int) -> dict[str, float]:
-    """The growth of memory in MB for each kind of use, and how many other things are left at the end."""
+    """Returns the growth of memory in MB for each kind of use, and the number of other things left at the end."""
     with tempfile.TemporaryDirectory() as folder:
         own = {"TMPDIR": folder, "DQN_KERAS_CACHE": f"{folder}/cache"}
         with mock.patch.dict(os.environ, own), mock.patch.object(tempfile, "tempdir", folder):
             for use in (use_an_agent, train_in_both_loops, study_here, study_in_new_workers):
-                use(1)  # TensorFlow starts its threads, and Python its process that looks after shared memory
+                use(1)  # TensorFlow starts its threads, and Python its process for shared memory
             before = held(Path(folder))
             figures = {
                 f"MB more after {num_agents} agents of learn": growth(use_an_agent, num_agents),

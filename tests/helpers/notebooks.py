@@ -1,4 +1,4 @@
-"""notebooks/render.py as a module, which is no package."""
+"""Imports notebooks/render.py, which is not in a package."""
 
 import importlib.util
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The original notebook's algorithm once more: plain, eager, slow, and independent of the package.
+"""A second implementation of the original's algorithm: plain, eager, slow, and independent of the package.
 
 It reads like the original: a deque of named tuples, a Keras call per state, a tf.function with the networks in
 its closure. What the original left to chance comes in as arguments, so that two programs can be given the same:

@@ -1,4 +1,4 @@
-"""Networks, optimizers and losses that a Keras user may bring, by name, and an eager Keras step to compare with."""
+"""Networks, optimizers and losses of Keras users, by name, and an eager Keras step to compare with."""
 
 import keras
 import numpy as np
@@ -39,7 +39,7 @@ def shared(inputs):
 
 
 class Scaled(layers.Layer):
-    """Multiplies by an attribute that no configuration holds."""
+    """Multiplies by an attribute that is not in its configuration."""
 
     factor = 1.0
 
@@ -48,7 +48,7 @@ class Scaled(layers.Layer):
 
 
 class Configured(layers.Layer):
-    """Has weights and an argument of its own."""
+    """Has its own weights and an argument."""
 
     def __init__(self, power, **kwargs):
         super().__init__(**kwargs)
@@ -165,7 +165,7 @@ ALL_NETWORKS = NETWORKS | INFERENCE_ONLY
 
 
 def two_of(make_network):
-    """Two networks, made apart, of equal weights."""
+    """Returns two separately made networks with equal weights."""
     first, second = make_network(), make_network()
     second.set_weights(first.get_weights())
     return first, second
@@ -245,7 +245,7 @@ LOSSES = {
 
 
 def in_keras_words(loss, y, q):
-    """The scalar that `compile(loss=loss)` stands for, of [B] values."""
+    """Returns the scalar loss that `compile(loss=loss)` computes from [B] values."""
     if callable(loss) and not isinstance(loss, keras.losses.Loss):
         return tf.reduce_mean(loss(y, q))
     loss = keras.losses.get(loss)
@@ -253,7 +253,7 @@ def in_keras_words(loss, y, q):
 
 
 def eager_step(batch, gamma, tau, q_network, q_hat_network, optimizer, loss="mse"):
-    """One step as `model.fit` takes it, op by op, and the soft update; independent of the package."""
+    """Takes one step as `model.fit` does, op by op, and the soft update, without the package."""
     states, actions, rewards, next_states, terminal_states = map(tf.constant, batch)
     y = rewards + (1 - terminal_states) * gamma * tf.reduce_max(q_hat_network(next_states), axis=1)
     with tf.GradientTape() as tape:

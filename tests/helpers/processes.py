@@ -6,7 +6,7 @@ import threading
 
 @contextlib.contextmanager
 def killed_after(seconds, process):
-    """Kills a process that is still running when the time is over, so that nobody waits for it forever."""
+    """Kills a process that is still running when the time is over, so that no test waits forever."""
     timer = threading.Timer(seconds, process.kill)
     timer.start()
     try:

@@ -1,4 +1,4 @@
-"""Short runs, and what to tell them apart by."""
+"""Short runs, and a digest to compare them."""
 
 import hashlib
 
@@ -11,14 +11,14 @@ QUICK = Config(num_episodes=30, batch_size=16, solved_reward=1000)
 
 
 def fingerprint(run):
-    """A digest of networks, optimizer and rewards."""
+    """Returns a digest of networks, optimizer and rewards."""
     arrays = [*run.q_network.get_weights(), *run.q_hat_network.get_weights()]
     arrays += [v.numpy() for v in run.agent.optimizer.variables]
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in [*arrays, run.rewards])).hexdigest()
 
 
 class Tape(keras.callbacks.Callback):
-    """Records its calls, and ends the run after the episode `stop_after`."""
+    """Records its calls, and stops the run after the episode `stop_after`."""
 
     def __init__(self, stop_after=None):
         super().__init__()
@@ -40,7 +40,7 @@ class Tape(keras.callbacks.Callback):
 
 
 class SpoiledVelocity(keras.callbacks.Callback):
-    """Makes one weight NaN at the next update, whose loss is finite still."""
+    """Makes one weight NaN at the next update, whose loss is still finite."""
 
     def on_epoch_begin(self, epoch, logs=None):
         if epoch == 12:

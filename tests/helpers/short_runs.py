@@ -1,4 +1,4 @@
-"""Short runs and single steps with parts of one's own, and what they leave in the weights."""
+"""Short runs and single steps with own parts, and the weights after them."""
 
 import gymnasium as gym
 import keras
@@ -19,13 +19,13 @@ def weights_of(*networks):
 
 
 def trained(make_env=CartPole, config=QUICK, **own):
-    """The weights after a short run with the same seed."""
+    """Returns the weights after a short run with the same seed."""
     run = train(make_env(), config, seed=0, verbose=0, **own)
     return weights_of(run.q_network, run.q_hat_network)
 
 
 def learned(batch, networks, optimizer, **own):
-    """The weights after one more step, from where the networks are."""
+    """Returns the weights after one more step of these networks."""
     learn(batch, 0.9, *networks, optimizer, **own)
     return networks[0].get_weights()
 
