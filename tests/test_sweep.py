@@ -25,6 +25,7 @@ from dqn_keras import (
     train,
     workers,
 )
+from dqn_keras._engine import programs
 from dqn_keras.environments import CartPole, MountainCar
 from tests.helpers.environments import Corridor
 
@@ -65,6 +66,52 @@ def test_a_seed_with_own_parts_is_the_run_of_train_with_them(env):
         run = train(env, QUICK, seed, **own, verbose=0)
         assert outcome.digest == hashlib.sha256(weights(run)).digest()
         np.testing.assert_array_equal(outcome.rewards, run.rewards)
+
+
+def clipped(norm=1.0):
+    return keras.optimizers.Adam(0.001, global_clipnorm=norm)
+
+
+def backwards():
+    optimizer = clipped()
+    step = optimizer.update_step
+    optimizer.update_step = lambda gradient, *others: step(-gradient, *others)
+    return optimizer
+
+
+def scheduled(first_rate):
+    schedule = keras.optimizers.schedules.PiecewiseConstantDecay([2, 4], [first_rate, 0.1, 0.01])
+    return keras.optimizers.SGD(schedule)
+
+
+@pytest.mark.parametrize(
+    ("makers", "num_traces"),
+    [
+        pytest.param([clipped] * 3, 1, id="equal"),
+        pytest.param([clipped, lambda: clipped(0.1), clipped], 2, id="a setting differs"),
+        pytest.param(
+            [lambda: scheduled(0.5), lambda: scheduled(0.2), lambda: scheduled(0.5)], 2, id="a schedule differs"
+        ),
+        pytest.param([clipped, backwards, backwards], 3, id="a method of the user's"),
+    ],
+)
+@pytest.mark.parametrize(
+    "env",
+    [
+        pytest.param(CartPole(), id="functional", marks=pytest.mark.slow),
+        pytest.param(gym.make("CartPole-v1"), id="Gym"),
+    ],
+)
+def test_seeds_share_a_trace_if_their_optimizers_are_keras_with_equal_settings(env, makers, num_traces, monkeypatch):
+    def run_all():
+        return [weights(train(env, QUICK, seed, optimizer=make(), verbose=0)) for seed, make in enumerate(makers)]
+
+    alone = run_all()
+    traced = []
+    monkeypatch.setattr(programs, "_trace", lambda *args, _trace=programs._trace: traced.append(args) or _trace(*args))
+    with programs.shared_in({}):  # as a study does
+        assert run_all() == alone
+    assert len(traced) == num_traces
 
 
 @pytest.mark.slow

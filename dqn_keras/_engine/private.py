@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -177,6 +177,45 @@ _PLAIN_ADAM = {
     "use_ema": False,
     "loss_scale_factor": None,
     "gradient_accumulation_steps": None,
+}
+
+
+def settings_of(optimizer: keras.Optimizer, variables: Sequence[keras.Variable]) -> Hashable | None:
+    """Returns a key that is equal for optimizers of one of Keras' classes with the same settings.
+
+    None if the class is not Keras' own, if an attribute is neither a setting nor Keras' own record of the variables, or
+    if the optimizer was built for other variables.
+    """
+    built_for = getattr(optimizer, "_trainable_variables", [])
+    if len(built_for) != len(variables) or any(a is not b for a, b in zip(built_for, variables, strict=True)):
+        return None
+    return _settings(optimizer)
+
+
+def _settings(value: Any) -> Hashable | None:
+    """Returns a setting with its type; None if it is not known that equal ones do the same."""
+    if value is None or type(value) in (bool, int, float, str):
+        return type(value), value
+    if isinstance(value, keras.Variable):  # its value is an input of the program
+        return tuple(value.shape), value.dtype
+    if isinstance(value, list | tuple):
+        items = tuple(map(_settings, value))
+        return None if None in items else items
+    kinds = keras.optimizers.Optimizer, keras.optimizers.schedules.LearningRateSchedule
+    if not isinstance(value, kinds) or not type(value).__module__.startswith("keras."):
+        return None
+    names = [name for name in sorted(vars(value)) if not name.startswith("_self_") and name not in _RECORDS]
+    items = tuple(_settings(vars(value)[name]) for name in names)
+    return None if None in items else (type(value), tuple(names), items)
+
+
+_RECORDS = {
+    "name",
+    "_distribution_strategy",
+    "_tracker",
+    "_trainable_variables",
+    "_trainable_variables_indices",
+    "_variables",
 }
 
 

@@ -3,7 +3,8 @@
 TensorFlow traces a function for particular variables, and the code that XLA compiles for a trace is never freed: a
 second agent would cost seconds of compilation and megabytes of memory. Therefore a program for networks that the
 package made is traced once, on a *stand-in* of the same sizes, and then called with the variables of any agent. A
-network or optimizer of the user is never rebuilt: its program is traced on the objects themselves.
+network or optimizer of the user is never rebuilt: its program is traced on the objects themselves. In a study, the seeds
+share it if the package made their networks and their optimizers are Keras' own with equal settings.
 """
 
 import contextlib
@@ -21,6 +22,7 @@ from dqn_keras._engine.private import (
     handle,
     is_built_for,
     is_plain_adam,
+    settings_of,
     traced,
 )
 from dqn_keras._engine.tensorflow import keras, require_xla, tf
@@ -63,6 +65,17 @@ class Learner(NamedTuple):
             return None
         return units if is_plain_adam(self.optimizer, self.q_network.trainable_variables) else None
 
+    def kind(self) -> Hashable | None:
+        """Returns a key that is equal for learners that compute the same.
+
+        None if that is not known, because a network or the class of the optimizer is the user's.
+        """
+        units = units_if_made_here(self.q_network)
+        settings = settings_of(self.optimizer, self.q_network.trainable_variables)
+        if units is None or units != units_if_made_here(self.q_hat_network) or settings is None:
+            return None
+        return units, settings
+
 
 class Actor(NamedTuple):
     """A network that acts and does not learn."""
@@ -77,6 +90,10 @@ class Actor(NamedTuple):
     def sizes(self) -> tuple[int, ...] | None:
         """Returns the layer sizes if the package made the network; else None."""
         return units_if_made_here(self.q_network)
+
+    def kind(self) -> Hashable | None:
+        """Returns the same."""
+        return self.sizes()
 
 
 def stand_in(units: Sequence[int], jit_compile: bool) -> Learner:
@@ -147,7 +164,7 @@ def bind(
         variables: further tf.Variables that the function changes.
         key: distinguishes the functions that `make_function` can make for learners of the same sizes.
         has_own_parts: whether the function calls code of the user other than the learner. If so, it is traced again
-            at each call of `bind`, except in a study.
+            at each call of `bind`; in a study, once.
         jit_compile: whether XLA compiles the function.
     """
     if jit_compile:
@@ -155,16 +172,19 @@ def bind(
     if not can_swap_variables():
         return _trace_the_public_way(make_function, specs, learner, variables, jit_compile)
     sizes = learner.sizes()
-    if sizes is None:
+    kind = sizes or learner.kind()
+    if kind is None:
         program = _trace(make_function, specs, learner, variables, jit_compile)
     else:
-        programs = _shared if not has_own_parts else {} if _of_this_study is None else _of_this_study
-        key = (key, sizes, tuple(specs), tuple((v.shape, v.dtype) for v in variables), jit_compile)
+        programs = _shared if sizes and not has_own_parts else {} if _of_this_study is None else _of_this_study
+        key = (key, kind, tuple(specs), tuple((v.shape, v.dtype) for v in variables), jit_compile)
         if key not in programs:
-            extra = [tf.Variable(tf.zeros_like(v)) for v in variables]
-            model = stand_in(sizes, jit_compile)
-            replaced = model if isinstance(learner, Learner) else Actor(model.q_network)
-            programs[key] = _trace(make_function, specs, replaced, extra, jit_compile)
+            model, extra = learner, variables
+            if sizes:
+                extra = [tf.Variable(tf.zeros_like(v)) for v in variables]
+                model = stand_in(sizes, jit_compile)
+                model = model if isinstance(learner, Learner) else Actor(model.q_network)
+            programs[key] = _trace(make_function, specs, model, extra, jit_compile)
         program = programs[key]
     handles = _handles(learner, variables)
     captured = [handles[x] if isinstance(x, int) else x for x in program.captured]
