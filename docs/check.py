@@ -1,9 +1,9 @@
-"""Open every page of the built site in headless Chromium, and say what is wrong with it.
+"""Opens every page of the built site in headless Chromium, and prints what is wrong with it.
 
 `make docs` runs it after the build. A page is wrong if it logs an error, asks another host for anything, has a picture
-that does not show or has no alt text, a link within the site that leads nowhere, or a formula left as LaTeX. The moving
-picture has to move, and the page "Watch it learn" to play. The search has to find, also when the site is opened from
-the disk.
+that does not show or has no alt text, a link within the site that leads nowhere, a formula left as LaTeX, or is wider
+than a phone. The moving picture has to move, and the page "Watch it learn" has to play. The search has to answer the
+questions of newcomers, also when the site is opened from a folder.
 """
 
 import functools
@@ -13,7 +13,7 @@ import sys
 import threading
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from urllib.parse import unquote, urldefrag, urlsplit
+from urllib.parse import quote, unquote, urldefrag, urlsplit, urlunsplit
 
 from playwright.sync_api import Browser, Page, Request, sync_playwright
 from playwright.sync_api import TimeoutError as PlaywrightTimeout
@@ -21,6 +21,19 @@ from playwright.sync_api import TimeoutError as PlaywrightTimeout
 SITE = Path(__file__).parent.parent / "site"
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 QUIET = ["--disable-quic", "--disable-sync"]  # beside Playwright's own: the browser itself asks no other host
+
+ANSWERS = {  # what a newcomer types -> the place that answers, which has to be in one of the first three results
+    "huber": "how_to/own_parts.html#a-loss-huber-and-your-own",
+    "double": "how_to/own_parts.html#targets-double-dqn-and-your-own",
+    "learning rate": "how_to/own_parts.html#an-optimizer-and-its-learning-rate",
+    "custom env": "how_to/own_environment.html",
+    "resume": "how_to/resume.html",
+    "seed": "how_to/many_seeds.html",
+    "tensorboard": "how_to/from_training_to_use.html#dashboards",
+    "gpu": "how_to/scripts.html#cpu-or-gpu",
+    "save": "how_to/scripts.html#save-the-network",
+    "lunarlander": "how_to/own_environment.html#environments-of-gymnasium",
+}
 
 LOOK = r"""async () => {
     const images = [...document.images];
@@ -67,8 +80,9 @@ def check(browser: Browser, host: str) -> int:
     if not moving:
         wrong["index.html"].append("no page has a moving picture")
     for where in (host, SITE.as_uri()):
-        if not finds(page, where, "ReplayMemory"):
-            wrong["index.html"].append(f"the search does not find ReplayMemory on pages of {where}")
+        for words, place in ANSWERS.items():
+            if not finds(page, where, words, place):
+                wrong["index.html"].append(f"on pages of {where}, the search for '{words}' does not find {place}")
     if not plays(page, host):
         wrong["watch_it_learn.html"].append("the pole does not move by itself")
 
@@ -141,15 +155,26 @@ def moves(page: Page, src: str) -> bool:
     return False
 
 
-def finds(page: Page, host: str, word: str) -> bool:
-    """Whether the search, which runs in the browser, has results for a word."""
-    page.goto(f"{host}/index.html")
+def finds(page: Page, host: str, words: str, place: str) -> bool:
+    """Whether the search, which runs in the browser, has the place in one of its first three results."""
+    page.goto(f"{host}/index.html?q={quote(words)}")
+    results = page.locator(".md-search-result__item")
     try:
-        page.locator("input.md-search__input").fill(word)
-        page.locator("a.md-search-result__link").first.wait_for(state="attached")
+        results.first.wait_for(state="attached")
     except PlaywrightTimeout:
         return False
-    return True
+    links = results.locator("a").evaluate_all(
+        """(links, items) => links.map(link => [
+            [...document.querySelectorAll(items)].indexOf(link.closest(items)), link.href
+        ])""",
+        ".md-search-result__item",
+    )
+    return any(index < 3 and without_query(href) == f"{host}/{place}" for index, href in links)
+
+
+def without_query(url: str) -> str:
+    """The URL without what the search adds to it, to highlight the words."""
+    return urlunsplit(urlsplit(url)._replace(query=""))
 
 
 def plays(page: Page, host: str) -> bool:

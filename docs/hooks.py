@@ -1,4 +1,4 @@
-"""What the site has beyond its plugins: the repository's notebooks and results as pages, and formulas as MathML."""
+"""Adds to the site what its plugins do not: pages of notebooks and results, links to the reference, formulas as MathML."""
 
 import base64
 import html
@@ -11,8 +11,18 @@ import nbformat
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parent.parent
+STUB = (ROOT / "dqn_keras" / "__init__.pyi").read_text()
+PUBLIC = {name: f"dqn_keras.{module}.{name}" for module, name in re.findall(r"from \.([\w.]+) import (\w+)", STUB)}
+MENTION = re.compile(
+    r"^(?P<ticks>`{3,}).*?^(?P=ticks)$"  # a code block: left as it is, like the next two
+    r"|^#+ .*?$|^<summary>.*?$"
+    r"|\[[^\]]*\](?:\([^)]*\)|\[(?P<target>[^\]]*)\])"  # a link; it counts as a mention
+    rf"|`(?P<name>{'|'.join(PUBLIC)})(?:[(\[][^`]*)?`",  # a public name, perhaps with arguments
+    re.DOTALL | re.MULTILINE,
+)
 ALT_TEXTS = {  # of the pictures in the notebooks, by the tag of their cell
     "save-rewards": "Episode rewards of one run: 20 and less for 170 episodes, then a climb to over 225",
     "save-pole": "The moving picture of one greedy episode: the network keeps the pole upright",
@@ -75,8 +85,31 @@ def fence(content: str, *classes: str) -> str:
     return f"````{{{' '.join('.' + name for name in classes)}}}\n{content.rstrip()}\n````"
 
 
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """Links the first mention of each public name to the reference. Lets the search show how-tos first."""
+    if page.url.startswith("how_to/") and not page.is_index:
+        page.meta["search"] = {"boost": 2}
+    return markdown if page.url.startswith("reference/") else link_public_names(markdown)
+
+
+def link_public_names(markdown: str) -> str:
+    """Returns the page with links; code, headings and existing links stay as they are."""
+    linked = set()
+
+    def link(mention: re.Match) -> str:
+        target = mention["target"] or PUBLIC.get(mention["name"])
+        if mention["name"] is None or target in linked:
+            linked.add(target)
+            return mention[0]
+        linked.add(target)
+        return f"[{mention[0]}][{target}]"
+
+    return MENTION.sub(link, markdown)
+
+
 def on_page_content(content: str, **_: Any) -> str:
-    r"""Formulas, which arithmatex has marked as \(...\) or \[...\], as MathML, which a browser shows by itself."""
+    r"""Replaces formulas, which arithmatex has marked as \(...\) or \[...\], by MathML, which browsers show without a script."""
+    content = content.replace('<details class="mkdocstrings-source">', '<details class="mkdocstrings-source" data-search-exclude>')
     content = re.sub(r'<span class="arithmatex">\\\((.*?)\\\)</span>', inline, content, flags=re.DOTALL)
     return re.sub(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', block, content, flags=re.DOTALL)
 
