@@ -73,7 +73,8 @@ def notebook_blocks(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
                 name = f"{path.stem}_{len(pictures) + 1}.png"
                 pictures[name] = base64.b64decode(data["image/png"])
                 tags = [tag for tag in cell.metadata.get("tags", []) if tag in ALT_TEXTS]
-                yield f"![{ALT_TEXTS[tags[0]] if tags else 'Picture: ' + heading}]({name})"
+                mark = "{ .moving }" if b"acTL" in pictures[name][:200] else ""
+                yield f"![{ALT_TEXTS[tags[0]] if tags else 'Picture: ' + heading}]({name}){mark}"
             elif "text/markdown" in data:
                 yield data["text/markdown"]
             else:
