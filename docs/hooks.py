@@ -1,4 +1,4 @@
-"""Adds to the site what its plugins do not: pages of notebooks and results, links to the reference, formulas as MathML."""
+"""Adds what the plugins do not: pages of notebooks and results, links to the reference, formulas as MathML."""
 
 import base64
 import html
@@ -15,7 +15,9 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parent.parent
 STUB = (ROOT / "dqn_keras" / "__init__.pyi").read_text()
-PUBLIC = {name: f"dqn_keras.{module}.{name}" for module, name in re.findall(r"from \.([\w.]+) import (\w+)", STUB)}
+PUBLIC = {
+    name: f"dqn_keras.{module}.{name}" for module, name in re.findall(r"from \.([\w.]+) import ([a-zA-Z]\w*)", STUB)
+}
 MENTION = re.compile(
     r"^(?P<ticks>`{3,}).*?^(?P=ticks)$"  # a code block: left as it is, like the next two
     r"|^#+ .*?$|^<summary>.*?$"
@@ -38,7 +40,7 @@ ALT_TEXTS = {  # of the pictures in the notebooks, by the tag of their cell
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add what is kept elsewhere in the repository, from where it is."""
+    """Adds the results and the notebooks, from where they are in the repository."""
     for path in sorted(ROOT.glob("results/**/*.*")):
         files.append(File.generated(config, path.relative_to(ROOT).as_posix(), abs_src_path=str(path)))
     for path in sorted(ROOT.glob("notebooks/*.ipynb")):
@@ -52,7 +54,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def notebook_blocks(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
-    """A notebook with its committed outputs as Markdown; nothing is executed. `pictures` is filled by file name."""
+    """Yields a notebook and its committed outputs as Markdown, without running it. Adds its pictures to `pictures`."""
     heading = ""
     cells = nbformat.read(path, as_version=4).cells
     kind = "A notebook, with its outputs" if any(cell.get("outputs") for cell in cells) else "A notebook to work in"
@@ -82,7 +84,7 @@ def notebook_blocks(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
 
 
 def fence(content: str, *classes: str) -> str:
-    """A code block; with four ticks, since the code may hold three."""
+    """Returns a code block, fenced by four backticks because the code may contain three."""
     return f"````{{{' '.join('.' + name for name in classes)}}}\n{content.rstrip()}\n````"
 
 
@@ -109,24 +111,26 @@ def link_public_names(markdown: str) -> str:
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    r"""Replaces formulas, which arithmatex has marked as \(...\) or \[...\], by MathML, which browsers show without a script."""
-    content = content.replace('<details class="mkdocstrings-source">', '<details class="mkdocstrings-source" data-search-exclude>')
+    r"""Replaces the formulas, which arithmatex marks as \(...\) or \[...\], by MathML, which needs no script."""
+    content = content.replace(  # the search finds names, not lines of source code
+        '<details class="mkdocstrings-source">', '<details class="mkdocstrings-source" data-search-exclude>'
+    )
     content = re.sub(r'<span class="arithmatex">\\\((.*?)\\\)</span>', inline, content, flags=re.DOTALL)
     return re.sub(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', block, content, flags=re.DOTALL)
 
 
 def inline(found: re.Match) -> str:
-    """A formula in a line."""
+    """Returns a formula within a line."""
     return mathml(found[1], "inline")
 
 
 def block(found: re.Match) -> str:
-    """A formula of its own; it scrolls where the page is narrow."""
+    """Returns a formula on a separate line; it scrolls on a narrow page."""
     return f'<div class="formula" tabindex="0">{mathml(found[1], "block")}</div>'
 
 
 def mathml(latex: str, display: str) -> str:
-    """LaTeX as MathML, put right where browsers would show it badly."""
+    """Returns LaTeX as MathML, corrected where browsers would show it badly."""
     markup = convert(html.unescape(latex).strip(), display=display)
     for pattern, better in REPAIRS:
         markup = re.sub(pattern, better, markup)
