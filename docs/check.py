@@ -1,9 +1,9 @@
-"""Open every page of the built site in headless Chromium, and say what is wrong with it.
+"""Opens every page of the built site in headless Chromium, and prints what is wrong with it.
 
 `make docs` runs it after the build. A page is wrong if it logs an error, asks another host for anything, has a picture
-that does not show or has no alt text, a link within the site that leads nowhere, or a formula left as LaTeX. The moving
-picture has to move, and the page "Watch it learn" to play. The search has to find, also when the site is opened from
-the disk.
+that does not show or has no alt text, a link within the site that leads nowhere, a formula left as LaTeX, or is wider
+than a phone. The moving picture has to move, and the page "Watch it learn" has to play. The search has to answer the
+questions of newcomers, also when the site is opened from a folder.
 """
 
 import functools
@@ -13,14 +13,28 @@ import sys
 import threading
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from urllib.parse import unquote, urldefrag, urlsplit
+from urllib.parse import quote, unquote, urldefrag, urlsplit, urlunsplit
 
-from playwright.sync_api import Browser, Page, Request, sync_playwright
+from playwright.sync_api import Browser, Page, Request, ViewportSize, sync_playwright
 from playwright.sync_api import TimeoutError as PlaywrightTimeout
 
 SITE = Path(__file__).parent.parent / "site"
 NAMES = ("chromium", "chromium-browser", "google-chrome")
+DESKTOP, PHONE = ViewportSize(width=1280, height=900), ViewportSize(width=390, height=844)
 QUIET = ["--disable-quic", "--disable-sync"]  # beside Playwright's own: the browser itself asks no other host
+
+ANSWERS = {  # what a newcomer types -> the place that answers, which has to be in one of the first three results
+    "huber": "how_to/own_parts.html#a-loss-huber-and-your-own",
+    "double": "how_to/own_parts.html#targets-double-dqn-and-your-own",
+    "learning rate": "how_to/own_parts.html#an-optimizer-and-its-learning-rate",
+    "custom env": "how_to/own_environment.html",
+    "resume": "how_to/resume.html",
+    "seed": "how_to/many_seeds.html",
+    "tensorboard": "how_to/from_training_to_use.html#dashboards",
+    "gpu": "how_to/scripts.html#cpu-or-gpu",
+    "save": "how_to/scripts.html#save-the-network",
+    "lunarlander": "how_to/own_environment.html#environments-of-gymnasium",
+}
 
 LOOK = r"""async () => {
     const images = [...document.images];
@@ -39,18 +53,18 @@ LOOK = r"""async () => {
 
 
 class Handler(SimpleHTTPRequestHandler):
-    """The site, without a line for each request."""
+    """Serves the site without printing a line for each request."""
 
     def log_message(self, *_: object) -> None:
-        """Nothing."""
+        """Prints nothing."""
 
 
 def check(browser: Browser, host: str) -> int:
-    """Look at every page; the number of things that are wrong."""
+    """Checks every page, and returns the number of problems."""
     names = sorted(str(path.relative_to(SITE)) for path in SITE.rglob("*.html"))
     wrong: dict[str, list[str]] = {name: [] for name in names}
     seen, moving = {}, 0
-    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page = browser.new_page(viewport=DESKTOP)
     page.set_default_timeout(120_000)  # a busy machine may be slow
     for name in names:
         seen[name] = look(page, host, name, wrong[name])
@@ -67,8 +81,9 @@ def check(browser: Browser, host: str) -> int:
     if not moving:
         wrong["index.html"].append("no page has a moving picture")
     for where in (host, SITE.as_uri()):
-        if not finds(page, where, "ReplayMemory"):
-            wrong["index.html"].append(f"the search does not find ReplayMemory on pages of {where}")
+        for words, place in ANSWERS.items():
+            if not finds(page, where, words, place):
+                wrong["index.html"].append(f"on pages of {where}, the search for '{words}' does not find {place}")
     if not plays(page, host):
         wrong["watch_it_learn.html"].append("the pole does not move by itself")
 
@@ -83,7 +98,7 @@ def check(browser: Browser, host: str) -> int:
 
 
 def look(page: Page, host: str, name: str, problems: list[str]) -> dict:
-    """Open one page; what is on it. `problems` is added to."""
+    """Opens one page and returns what is on it. Adds to `problems`."""
     listeners = {
         "console": lambda message: message.type == "error" and problems.append(f"console: {message.text}"),
         "pageerror": lambda error: problems.append(f"error: {error}"),
@@ -95,6 +110,10 @@ def look(page: Page, host: str, name: str, problems: list[str]) -> dict:
         page.on(event, listener)
     page.goto(f"{host}/{name}", wait_until="networkidle")
     found = page.evaluate(LOOK)
+    page.set_viewport_size(PHONE)
+    if (width := page.evaluate("document.documentElement.scrollWidth")) > PHONE["width"]:
+        problems.append(f"wider than a phone: {width} pixels")
+    page.set_viewport_size(DESKTOP)
     page.wait_for_load_state("networkidle")  # pictures further down are loaded when `LOOK` decodes them
     for event, listener in listeners.items():
         page.remove_listener(event, listener)
@@ -108,17 +127,17 @@ def look(page: Page, host: str, name: str, problems: list[str]) -> dict:
 
 
 def is_failure(request: Request) -> bool:
-    """Whether the request failed by itself: the browser cancels those of a page that it leaves."""
+    """Returns whether a request failed. Those that the browser cancels when it leaves a page do not count."""
     return request.failure != "net::ERR_ABORTED"
 
 
 def foreign(url: str, host: str) -> bool:
-    """Whether it is neither of the site nor held in the page itself."""
+    """Returns whether a URL is neither on the site nor data within a page."""
     return not url.startswith((f"{host}/", "data:", "blob:"))
 
 
 def broken(link: str, host: str, seen: dict[str, dict]) -> str:
-    """What is wrong with a link within the site; nothing for any other."""
+    """Returns what is wrong with a link within the site; an empty string for any other link."""
     if not link.startswith(f"{host}/"):
         return ""
     target, fragment = urldefrag(link)
@@ -131,7 +150,7 @@ def broken(link: str, host: str, seen: dict[str, dict]) -> str:
 
 
 def moves(page: Page, src: str) -> bool:
-    """Whether a picture looks different a moment later."""
+    """Returns whether a picture looks different a moment later."""
     image = page.locator(f'img[src$="{src.rsplit("/", 1)[1]}"]').first
     first = image.screenshot()
     for _ in range(10):
@@ -141,19 +160,30 @@ def moves(page: Page, src: str) -> bool:
     return False
 
 
-def finds(page: Page, host: str, word: str) -> bool:
-    """Whether the search, which runs in the browser, has results for a word."""
-    page.goto(f"{host}/index.html")
+def finds(page: Page, host: str, words: str, place: str) -> bool:
+    """Returns whether one of the first three results of the search, which runs in the browser, has the place."""
+    page.goto(f"{host}/index.html?q={quote(words)}")
+    results = page.locator(".md-search-result__item")
     try:
-        page.locator("input.md-search__input").fill(word)
-        page.locator("a.md-search-result__link").first.wait_for(state="attached")
+        results.first.wait_for(state="attached")
     except PlaywrightTimeout:
         return False
-    return True
+    links = results.locator("a").evaluate_all(
+        """(links, items) => links.map(link => [
+            [...document.querySelectorAll(items)].indexOf(link.closest(items)), link.href
+        ])""",
+        ".md-search-result__item",
+    )
+    return any(index < 3 and without_query(href) == f"{host}/{place}" for index, href in links)
+
+
+def without_query(url: str) -> str:
+    """Returns the URL without the query that the search adds to highlight words."""
+    return urlunsplit(urlsplit(url)._replace(query=""))
 
 
 def plays(page: Page, host: str) -> bool:
-    """Whether the page "Watch it learn" starts, and counts its steps."""
+    """Returns whether the page "Watch it learn" starts and counts its steps."""
     page.goto(f"{host}/watch_it_learn.html")
     try:
         page.wait_for_function("parseInt(document.querySelector('#step').textContent) > 5")
@@ -163,15 +193,15 @@ def plays(page: Page, host: str) -> bool:
 
 
 def find_chromium() -> str | None:
-    """The path of a Chromium, if there is one."""
+    """Returns the path of a Chromium, if there is one."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
 def main() -> int:
-    """The exit status: 0 if all is well, or if there is no browser and none is required."""
+    """Returns the exit status: 0 if all is well, or if there is no browser and none is required."""
     chromium = find_chromium()
     if chromium is None:
-        print("The pages are built, but not looked at: there is no Chromium (apt-get install chromium).")
+        print("The pages are built but not checked: there is no Chromium (apt-get install chromium).")
         return int(os.environ.get("REQUIRE_BROWSER") == "1")
     server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=SITE))
     threading.Thread(target=server.serve_forever, daemon=True).start()

@@ -1,4 +1,4 @@
-"""What the site has beyond its plugins: the repository's notebooks and results as pages, and formulas as MathML."""
+"""Adds what the plugins do not: pages of notebooks and results, links to the reference, formulas as MathML."""
 
 import base64
 import html
@@ -11,8 +11,20 @@ import nbformat
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parent.parent
+STUB = (ROOT / "dqn_keras" / "__init__.pyi").read_text()
+PUBLIC = {
+    name: f"dqn_keras.{module}.{name}" for module, name in re.findall(r"from \.([\w.]+) import ([a-zA-Z]\w*)", STUB)
+}
+MENTION = re.compile(
+    r"^(?P<ticks>`{3,}).*?^(?P=ticks)$"  # a code block: left as it is, like the next two
+    r"|^#+ .*?$|^<summary>.*?$"
+    r"|\[[^\]]*\](?:\([^)]*\)|\[(?P<target>[^\]]*)\])"  # a link; it counts as a mention
+    rf"|`(?P<name>{'|'.join(PUBLIC)})(?:[(\[][^`]*)?`",  # a public name, perhaps with arguments
+    re.DOTALL | re.MULTILINE,
+)
 ALT_TEXTS = {  # of the pictures in the notebooks, by the tag of their cell
     "save-rewards": "Episode rewards of one run: 20 and less for 170 episodes, then a climb to over 225",
     "save-pole": "The moving picture of one greedy episode: the network keeps the pole upright",
@@ -28,7 +40,7 @@ ALT_TEXTS = {  # of the pictures in the notebooks, by the tag of their cell
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add what is kept elsewhere in the repository, from where it is."""
+    """Adds the results and the notebooks, from where they are in the repository."""
     for path in sorted(ROOT.glob("results/**/*.*")):
         files.append(File.generated(config, path.relative_to(ROOT).as_posix(), abs_src_path=str(path)))
     for path in sorted(ROOT.glob("notebooks/*.ipynb")):
@@ -42,7 +54,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def notebook_blocks(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
-    """A notebook with its committed outputs as Markdown; nothing is executed. `pictures` is filled by file name."""
+    """Yields a notebook and its committed outputs as Markdown, without running it. Adds its pictures to `pictures`."""
     heading = ""
     cells = nbformat.read(path, as_version=4).cells
     kind = "A notebook, with its outputs" if any(cell.get("outputs") for cell in cells) else "A notebook to work in"
@@ -63,7 +75,8 @@ def notebook_blocks(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
                 name = f"{path.stem}_{len(pictures) + 1}.png"
                 pictures[name] = base64.b64decode(data["image/png"])
                 tags = [tag for tag in cell.metadata.get("tags", []) if tag in ALT_TEXTS]
-                yield f"![{ALT_TEXTS[tags[0]] if tags else 'Picture: ' + heading}]({name})"
+                mark = "{ .moving }" if b"acTL" in pictures[name][:200] else ""
+                yield f"![{ALT_TEXTS[tags[0]] if tags else 'Picture: ' + heading}]({name}){mark}"
             elif "text/markdown" in data:
                 yield data["text/markdown"]
             else:
@@ -71,28 +84,53 @@ def notebook_blocks(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
 
 
 def fence(content: str, *classes: str) -> str:
-    """A code block; with four ticks, since the code may hold three."""
+    """Returns a code block, fenced by four backticks because the code may contain three."""
     return f"````{{{' '.join('.' + name for name in classes)}}}\n{content.rstrip()}\n````"
 
 
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """Links the first mention of each public name to the reference. Lets the search show how-tos first."""
+    if page.url.startswith("how_to/") and not page.is_index:
+        page.meta["search"] = {"boost": 2}
+    return markdown if page.url.startswith("reference/") else link_public_names(markdown)
+
+
+def link_public_names(markdown: str) -> str:
+    """Returns the page with links; code, headings and existing links stay as they are."""
+    linked = set()
+
+    def link(mention: re.Match) -> str:
+        target = mention["target"] or PUBLIC.get(mention["name"])
+        if mention["name"] is None or target in linked:
+            linked.add(target)
+            return mention[0]
+        linked.add(target)
+        return f"[{mention[0]}][{target}]"
+
+    return MENTION.sub(link, markdown)
+
+
 def on_page_content(content: str, **_: Any) -> str:
-    r"""Formulas, which arithmatex has marked as \(...\) or \[...\], as MathML, which a browser shows by itself."""
+    r"""Replaces the formulas, which arithmatex marks as \(...\) or \[...\], by MathML, which needs no script."""
+    content = content.replace(  # the search finds names, not lines of source code
+        '<details class="mkdocstrings-source">', '<details class="mkdocstrings-source" data-search-exclude>'
+    )
     content = re.sub(r'<span class="arithmatex">\\\((.*?)\\\)</span>', inline, content, flags=re.DOTALL)
     return re.sub(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', block, content, flags=re.DOTALL)
 
 
 def inline(found: re.Match) -> str:
-    """A formula in a line."""
+    """Returns a formula within a line."""
     return mathml(found[1], "inline")
 
 
 def block(found: re.Match) -> str:
-    """A formula of its own; it scrolls where the page is narrow."""
+    """Returns a formula on a separate line; it scrolls on a narrow page."""
     return f'<div class="formula" tabindex="0">{mathml(found[1], "block")}</div>'
 
 
 def mathml(latex: str, display: str) -> str:
-    """LaTeX as MathML, put right where browsers would show it badly."""
+    """Returns LaTeX as MathML, corrected where browsers would show it badly."""
     markup = convert(html.unescape(latex).strip(), display=display)
     for pattern, better in REPAIRS:
         markup = re.sub(pattern, better, markup)

@@ -1,8 +1,8 @@
-"""Write the networks that the page "Watch it learn" plays with: those of every tenth episode of one training run.
+"""Writes the networks for the page "Watch it learn": one for every tenth episode of a training run.
 
     python docs/snapshots.py [FILE]
 
-It trains as the lesson does, with seed 0, and writes docs/assets/snapshots.js. That is JSON behind `const RUN =`,
+It trains as the lesson does, with seed 0, and writes docs/assets/snapshots.js. The file is JSON behind `const RUN =`,
 because a page that is opened from a folder may load scripts but not fetch files. Weights are rounded to five
 significant digits.
 """
@@ -34,7 +34,7 @@ class Snapshots(keras.callbacks.Callback):
         self.weights: dict[int, list[np.ndarray]] = {}
 
     def on_epoch_end(self, epoch: int, logs: dict | None = None) -> None:
-        """Keeps the weights if it is their turn."""
+        """Keeps the weights of every tenth episode."""
         if epoch % EVERY == 0:
             self.weights[epoch] = self.model.get_weights()
 

@@ -1,4 +1,4 @@
-import importlib
+import importlib.util
 import inspect
 import re
 from pathlib import Path
@@ -81,6 +81,32 @@ def test_every_cross_reference_names_what_is_in_the_reference():
     for page in PAGES:
         for name in re.findall(r"\]\[(dqn_keras[\w.]*)\]", page.read_text()):
             assert any(name == path or name.startswith(f"{path}.") for path in paths), name
+
+
+def test_the_first_mention_of_a_public_name_on_a_page_links_to_the_reference():
+    pytest.importorskip("latex2mathml")  # of the extra docs, like the two below
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("nbformat")
+    spec = importlib.util.spec_from_file_location("hooks", DOCS / "hooks.py")
+    hooks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    page = """# `train`
+[`sweep`][dqn_keras.study.sweep] and [`study`](page.md), `sweep` and `train(env)`, `train` and `Config(tau=1)`.
+```
+`Run`
+```
+`Run` and `run` and `evaluated`
+"""
+    train, config = "[`train(env)`][dqn_keras.training.train]", "[`Config(tau=1)`][dqn_keras.config.Config]"
+    expected = page.replace("`train(env)`", train).replace("`Config(tau=1)`", config)
+    expected = expected.replace("`Run` and", "[`Run`][dqn_keras.training.Run] and")
+    assert hooks.link_public_names(page) == expected
+    paths = {
+        path
+        for page in (DOCS / "reference").glob("*.md")
+        for path in re.findall(r"^::: (\S+)$", page.read_text(), re.MULTILINE)
+    }
+    assert set(hooks.PUBLIC.values()) <= paths
 
 
 def test_the_design_names_every_module():

@@ -1,4 +1,4 @@
-/* iframe-worker 1.0.4 (https://github.com/squidfunk/iframe-worker), by which the search runs on a page that is opened from the disk.
+/* iframe-worker 1.0.4 (https://github.com/squidfunk/iframe-worker), with which the search runs on a page that is opened from a folder.
 Copyright (c) 2020-2022 Martin Donath <martin.donath@squidfunk.com>
 
 Permission is hereby granted, free of charge, to any person obtaining a copy

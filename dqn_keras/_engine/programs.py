@@ -3,7 +3,7 @@
 TensorFlow traces a function for particular variables, and the code that XLA compiles for a trace is never freed: a
 second agent would cost seconds of compilation and megabytes of memory. Therefore a program for networks that the
 package made is traced once, on a *stand-in* of the same sizes, and then called with the variables of any agent. A
-network or optimizer of the user is never rebuilt: its program is traced on the objects themselves. In a study, the seeds
+network or optimizer of the user is never rebuilt: its program is traced on the objects themselves. In a study, seeds
 share it if the package made their networks and their optimizers are Keras' own with equal settings.
 """
 
