@@ -81,11 +81,12 @@ def main() -> None:
     rows = [*itertools.product(("falls from 1",), (1, 2, 4, 8), memories), *(("is 0.1", 4, name) for name in memories)]
 
     versions = f"tensorflow {tf.__version__}, keras {keras.__version__}, gymnasium {gym.__version__}"
-    print("# What the climb waits for\n")
+    print("# What makes the learning curve climb\n")
     print(f"`python -m benchmarks.climb --seeds {num_seeds}`: compiled CartPole, seeds 0 to {num_seeds - 1} (Python")
     print(f"{platform.python_version()}, {versions}, numpy {np.__version__}). The climb: the first episode after which")
     print("the mean reward of the last 20 is above 50. Prefilled: the memory holds 5,000 transitions of random actions")
-    print("before the first episode. All else is the original's. Medians over the seeds, in brackets 95 % intervals.\n")
+    print("before the first episode. Everything else is the original's. Medians over the seeds; in brackets, 95 %")
+    print("intervals.\n")
     print("| epsilon | an update every | memory at the start | episodes | env steps | updates |")
     print("|---|---|---|---|---|---|")
     for epsilon, steps_per_update, name in tqdm(rows, unit="row"):

@@ -53,8 +53,8 @@ def main() -> None:
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # Linux; the processes inherit it
     print("# From nothing to solved\n")
     print(f"`python -m benchmarks.solve --seeds {arguments.seeds}`: a fresh process for each seed, one core. Training")
-    print("holds all of a run but its compilation, the building of its networks too. JAX, which Keras and TensorFlow")
-    print(f"import wherever it is, is {'' if importlib.util.find_spec('jax') else 'not '}installed.\n")
+    print("is a whole run except for its compilation; it includes building the networks. JAX, which Keras")
+    print(f"and TensorFlow import if they find it, is {'' if importlib.util.find_spec('jax') else 'not '}installed.\n")
     print(
         "| seed | start to solved, s | second process, s | imports, s | trace, compile, s | training, s "
         "| env steps/s of it | env steps/s of 400 episodes | solved at |"

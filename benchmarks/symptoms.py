@@ -65,7 +65,7 @@ def main() -> None:
     versions = [f"{p} {importlib.metadata.version(p)}" for p in ("tensorflow", "keras", "gymnasium", "numpy")]
     print("# What it looks like when it does not learn\n")
     print(
-        "`python -m benchmarks.symptoms`: CartPole-v1, default parameters but for what is wrong, seed 0; "
+        "`python -m benchmarks.symptoms`: CartPole-v1, default parameters except for what is wrong, seed 0; "
         "20 greedy episodes."
     )
     print(f"Python {platform.python_version()}, {', '.join(versions)}.\n")
