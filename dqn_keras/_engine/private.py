@@ -128,7 +128,7 @@ def all_layers(network: keras.Model) -> list[keras.layers.Layer]:
 
 
 def walk(network: keras.Model) -> list[keras.layers.Layer]:
-    """Returns the same layers as `all_layers`, found through the public API."""
+    """Returns the same layers as `all_layers`, using only the public API."""
     layers: list[keras.layers.Layer] = []
     to_do = list(network.layers)
     while to_do:

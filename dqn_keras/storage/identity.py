@@ -1,4 +1,4 @@
-"""The identity of a run: everything that must be equal for two runs to be the same, in a form for a file."""
+"""The identity of a run: everything that must be equal for two runs to count as the same, as JSON values."""
 
 import dataclasses
 import json
