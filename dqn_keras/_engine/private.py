@@ -186,5 +186,5 @@ def arguments_of_compile(network: keras.Model) -> dict[str, Any]:
 
 
 def output_shape_of_lambda(layer: keras.layers.Lambda) -> Any:
-    """Returns the given output shape; None if it is unknown, so that Keras computes it."""
+    """Returns the output shape that a Lambda layer was given; None if it is unknown, so that Keras computes it."""
     return getattr(layer, "_output_shape", None)

@@ -20,7 +20,7 @@ FORMAT = 6
 
 
 class DamagedError(ValueError):
-    """The error for a file that is not a whole checkpoint."""
+    """The error for a file that is damaged, or is not a checkpoint of this version."""
 
 
 def to_bytes(arrays: Mapping[str, Any], facts: dict[str, Any]) -> bytes:
