@@ -72,9 +72,9 @@ class Evaluation(keras.callbacks.Callback):
     as without the callback. With it, as with most callbacks, compiled episodes are played one at a time.
 
     The mean return is logged as `greedy_return`: in `run.history`, and for all other callbacks, wherever they are in
-    the list. An episode without an evaluation logs the latest mean return, not NaN, because Keras' callbacks would keep
-    a first NaN as their best value. So `EarlyStopping("greedy_return", mode="max", patience=...)` counts its
-    patience in episodes. The evaluation at the end comes after the last episode's log.
+    the list. An episode without an evaluation logs the latest mean return, not NaN: if a NaN came first, Keras'
+    callbacks would keep it as their best value. So `EarlyStopping("greedy_return", mode="max", patience=...)` counts
+    its patience in episodes. The evaluation at the end comes after the last episode's log.
 
     A new run replaces the file `best`. A resumed run first evaluates the network in the file, and replaces it only with
     a better one.

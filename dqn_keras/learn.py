@@ -90,7 +90,7 @@ def update_q_hat(q_network: keras.Model, q_hat_network: keras.Model, tau: Any = 
 DEFAULT_FORMULAS = Formulas(td_targets, "mse")
 
 
-def packages(formulas: Formulas) -> Formulas | None:
+def known_formulas(formulas: Formulas) -> Formulas | None:
     """Returns the formulas if they are the package's or Keras' own, which never change in a process; else None."""
     are_known = any(formulas.targets is x for x in (td_targets, double_td_targets)) and isinstance(formulas.loss, str)
     return formulas if are_known else None
@@ -190,7 +190,7 @@ def learn(
             learner.prepare()
         return gradient_step(batch, gamma, *learner, tau, formulas).loss
     make_step, batch_size = partial(_make_step, formulas), batch.reward.shape[0]
-    step = compiled_step(make_step, learner, formulas, packages(formulas), batch_size, jit_compile)
+    step = compiled_step(make_step, learner, formulas, known_formulas(formulas), batch_size, jit_compile)
     return step(*batch, gamma, tau)[0]
 
 

@@ -199,8 +199,8 @@ def plot_study(
     Args:
         study: a study with any number of seeds.
         axes: the three Axes to draw in; by default, a new figure of 15 by 4.5 inches.
-        published: the episodes that one published run needed, such as the original's 293, to mark them; None marks
-            nothing.
+        published: the number of episodes of one published run, such as the original's 293, to mark in the plots; None
+            marks nothing.
         x: the unit of the x-axes: "episodes" or "env_steps".
     """
     check_instance("study", study, Study, "a Study")

@@ -102,7 +102,7 @@ class ReplayMemory:
         check_rng(rng)
         num_kept = len(self)
         if check_count("batch_size", batch_size) > num_kept:
-            raise ValueError(f"batch_size must be at most {num_kept}, the transitions in the memory, got {batch_size}")
+            raise ValueError(f"batch_size must be at most {num_kept}, what the memory holds so far, got {batch_size}")
         indices = rng.choice(num_kept, batch_size, replace=False)  # [B]
         if self.num_appended > len(self.rows):
             indices = (indices + self.num_appended) % len(self.rows)

@@ -19,7 +19,7 @@ from dqn_keras.agent import Agent, keeps_averages, make_agent, optimizer_shown, 
 from dqn_keras.callbacks import Listeners
 from dqn_keras.checks.environments import CheckedEnv, Spaces, check_environment, env_name, some_states
 from dqn_keras.checks.formulas import Formulas
-from dqn_keras.checks.observations import Watch, check_state
+from dqn_keras.checks.observations import StateWatch, check_state
 from dqn_keras.checks.run import check_arguments, check_callbacks, check_checkpoint, check_own_parts
 from dqn_keras.config import Config
 from dqn_keras.interruption import TrainingInterrupted, stop_requests
@@ -195,7 +195,7 @@ def train(
                 print(f"Resumed at episode {len(agent.episodes)} from {resumed_from}" if resumed_from else "A new run")
         run = Run(config, agent, steps_per_second=[math.nan] * len(agent.episodes), first_action=spaces.first_action)
         episodes_per_call = min(100, checkpoint_every) if checkpoints else 100
-        watch = Watch(env_name(env), env.observation_space, is_default_network=q_network is None)
+        watch = StateWatch(env_name(env), env.observation_space, is_default_network=q_network is None)
         played = _timed(_episodes(env, spaces, run, formulas, callbacks, episodes_per_call, watch), run)
         with Progress(run, verbose) as progress, stop_requests() as is_asked_to_stop, optimizer_shown(agent):
             listeners = Listeners(run, callbacks)
@@ -253,7 +253,7 @@ def _episodes(
     formulas: Formulas,
     callbacks: Sequence[keras.callbacks.Callback],
     episodes_per_call: int,
-    watch: Watch,
+    watch: StateWatch,
 ) -> Iterator[Episode]:
     """Returns the episodes, played by the loop for this kind of environment."""
     if not isinstance(env, FuncEnv):

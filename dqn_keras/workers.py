@@ -1,4 +1,4 @@
-"""Workers: train many seeds and settings in parallel, in processes on this machine or on a Ray cluster."""
+"""Trains many seeds and settings in parallel, in processes on this machine or on a Ray cluster."""
 
 import contextlib
 import functools

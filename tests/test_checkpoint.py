@@ -335,7 +335,7 @@ def test_a_folder_that_cannot_be_one_is_an_error_before_any_work(tmp_path):
     with pytest.raises(OSError, match="file"):
         train(env, QUICK, verbose=0, checkpoint=tmp_path / "file" / "runs")
     assert env.reset_seeds == []
-    with pytest.raises(ValueError, match=r"^resume needs .* checkpoint, got None"):
+    with pytest.raises(ValueError, match=r"^resume needs .* checkpoint must be a path, got None"):
         train(env, QUICK, resume=True)
     with pytest.raises(ValueError, match=r"^checkpoint_every must be"):
         train(env, QUICK, checkpoint=tmp_path, checkpoint_every=0)

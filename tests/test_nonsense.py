@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 from dqn_keras import Config, evaluate, make_q_network, study, train
 from dqn_keras.checks.environments import CheckedEnv, check_spaces
-from dqn_keras.checks.observations import Watch, as_float
+from dqn_keras.checks.observations import StateWatch, as_float
 from dqn_keras.cli.run_folder import EnvOptions
 from dqn_keras.environments import Acrobot, CartPole, MountainCar
 from dqn_keras.rendering import record_episode
@@ -145,8 +145,8 @@ def warnings_in(env, config=FEW, **parts):
 
 
 def warnings_about(states, space, is_default_network=False):
-    """Returns the warnings of a Watch that sees these states."""
-    watch, memory = Watch("name", space, is_default_network), ReplayMemory(len(states) - 1, space.shape)
+    """Returns the warnings of a StateWatch that sees these states."""
+    watch, memory = StateWatch("name", space, is_default_network), ReplayMemory(len(states) - 1, space.shape)
     for state, next_state in itertools.pairwise(states):
         memory.append(Experience(state, 0, 0.0, next_state, False))
         watch.see(state, {})
@@ -290,7 +290,7 @@ def test_a_run_on_a_clock_is_one_warning():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.int16, np.uint8, bool])
 def test_numbers_that_float32_holds_exactly_are_not_collected(dtype):
-    watch = Watch("name", BOX, is_default_network=True)
+    watch = StateWatch("name", BOX, is_default_network=True)
     watch.see(np.zeros(2, dtype), {})
     assert not watch._precise
 
@@ -355,7 +355,7 @@ def test_an_action_mask_is_one_warning_that_it_is_ignored(at_reset):
 def test_only_the_first_thousand_states_are_watched():
     seen = []
 
-    class Counting(Watch):
+    class Counting(StateWatch):
         def see(self, observation, info):
             seen.append(observation)
             return super().see(observation, info)

@@ -68,7 +68,7 @@ def use_cache(choice: str) -> None:
 
 
 def publish() -> None:
-    """Makes the programs that this process has compiled available to later processes; deletes the oldest of many."""
+    """Shares the programs that this process has compiled with later processes; of many, deletes the oldest."""
     if _own is None:
         return
     with contextlib.suppress(OSError):  # a full disk, or another process has deleted the file

@@ -61,7 +61,7 @@ def _check_methods(network: keras.Model, second: keras.Model) -> None:
         if type(layer) is not type(copied) or "call" in vars(layer):
             raise ValueError(
                 f"q_network cannot be copied for Q-hat: {layer.name!r} ({type(layer).__name__}) has a `call` of its "
-                "own that its copy would not have; put it into a layer of its own class"
+                "own that its copy would not have; define it in a class"
             )
 
 

@@ -128,7 +128,7 @@ def all_layers(network: keras.Model) -> list[keras.layers.Layer]:
 
 
 def walk(network: keras.Model) -> list[keras.layers.Layer]:
-    """Returns the same layers as `all_layers`, found through the public API."""
+    """Returns the same layers as `all_layers`, using only the public API."""
     layers: list[keras.layers.Layer] = []
     to_do = list(network.layers)
     while to_do:
@@ -225,5 +225,5 @@ def arguments_of_compile(network: keras.Model) -> dict[str, Any]:
 
 
 def output_shape_of_lambda(layer: keras.layers.Lambda) -> Any:
-    """Returns the given output shape; None if it is unknown, so that Keras computes it."""
+    """Returns the output shape that a Lambda layer was given; None if it is unknown, so that Keras computes it."""
     return getattr(layer, "_output_shape", None)

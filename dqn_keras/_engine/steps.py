@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from dqn_keras._engine.private import all_layers
 from dqn_keras._engine.programs import Learner, bind
 from dqn_keras._engine.tensorflow import tf
-from dqn_keras._engine.watching import Watch
+from dqn_keras._engine.watching import ChangeWatch
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.checks.networks import warn_of_inference_mode
 
@@ -18,7 +18,7 @@ class _Step(NamedTuple):
     """A compiled step and the objects that it was compiled for."""
 
     parts: tuple[Any, ...]
-    watch: Watch
+    watch: ChangeWatch
     call: Callable[..., list[tf.Tensor]]
 
 
@@ -58,7 +58,7 @@ def compiled_step(
     if not steps.num_compiled:
         warn_of_inference_mode(learner.q_network)
     call = _bind(make_step, learner, key, size, jit)
-    watch = Watch(*parts, *all_layers(learner.q_network), *all_layers(learner.q_hat_network))
+    watch = ChangeWatch(*parts, *all_layers(learner.q_network), *all_layers(learner.q_hat_network))
     steps.kept = [*steps.kept[1 - _MOST_KEPT :], _Step(parts, watch, call)]
     steps.num_compiled += 1
     if steps.num_compiled == _MOST_KEPT:

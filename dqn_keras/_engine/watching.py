@@ -1,6 +1,6 @@
 """Finds out whether an object that `learn` was compiled for has changed since.
 
-A trace reads attributes, closures and global names once. `Watch` remembers their values: a comparison takes a few
+A trace reads attributes, closures and global names once. `ChangeWatch` remembers their values: a comparison takes a few
 microseconds, while a new trace takes a second.
 """
 
@@ -42,7 +42,7 @@ class _Look(NamedTuple):
     seen: Any
 
 
-class Watch:
+class ChangeWatch:
     """Remembers the state of some objects, as far as a trace can read it.
 
     The state contains, recursively:

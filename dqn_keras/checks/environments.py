@@ -11,7 +11,7 @@ from gymnasium.experimental.functional import FuncEnv
 from dqn_keras._engine.tensorflow import keras, require_xla, tf
 from dqn_keras.checks.networks import check_fits
 from dqn_keras.checks.numbers import shown
-from dqn_keras.checks.observations import Watch, as_float, as_numbers, feature_name
+from dqn_keras.checks.observations import StateWatch, as_float, as_numbers, feature_name
 from dqn_keras.environments import key_of_twin
 
 
@@ -23,7 +23,7 @@ class CheckedEnv:
     also sees the first states of a run.
     """
 
-    def __init__(self, env: gym.Env, watch: Watch | None = None) -> None:
+    def __init__(self, env: gym.Env, watch: StateWatch | None = None) -> None:
         if not isinstance(env, gym.Env):
             raise TypeError(f"env must be a gymnasium.Env, got {not_an_env(env)}")
         self.name = env_name(env)
@@ -94,7 +94,7 @@ class CheckedEnv:
 
 
 def env_name(env: gym.Env | FuncEnv) -> str:
-    """Returns the name of an environment for messages: its registered id or, without one, its class."""
+    """Returns the name of an environment for messages: its registered id, or else its class."""
     if isinstance(env, FuncEnv):
         return type(env).__name__
     return env.spec.id if env.spec else type(env.unwrapped).__name__

@@ -60,7 +60,7 @@ def hints_at_fields(cls: type[T]) -> type[T]:
         init(self, *values, **fields)
 
     def __setattr__(self: T, name: str, value: Any) -> None:  # noqa: N807
-        if name not in names and type(self) is not cls:  # a subclass may have attributes of its own
+        if name not in names and type(self) is not cls:  # a subclass may have its own attributes
             object.__setattr__(self, name, value)
             return
         if name not in names:

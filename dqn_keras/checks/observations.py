@@ -72,7 +72,7 @@ def feature_name(state_shape: tuple[int, ...], i: int) -> str:
     return f"feature {index[0] if len(index) == 1 else index}"
 
 
-class Watch:
+class StateWatch:
     """Looks at the first 1,000 states of a run, and warns once of each likely mistake in them.
 
     Args:

@@ -57,7 +57,7 @@ def check_callbacks(
 
 
 def _check_evaluation(evaluation: Evaluation, env: gym.Env | FuncEnv) -> None:
-    """Raises ValueError unless the evaluation has an environment of its own with the states and actions of `env`."""
+    """Raises ValueError unless the evaluation has a second environment with the states and actions of `env`."""
     if isinstance(env, gym.Env) and isinstance(evaluation.env, gym.Env) and env.unwrapped is evaluation.env.unwrapped:
         raise ValueError(
             f"callbacks must evaluate in an environment of their own, got an Evaluation in env {env_name(env)} itself: "
@@ -71,7 +71,7 @@ def check_checkpoint(checkpoint: str | os.PathLike | None, checkpoint_every: int
     if checkpoint is not None:
         check_path("checkpoint", checkpoint)
     if check_flag("resume", resume) and checkpoint is None:
-        raise ValueError("resume needs a folder to resume from: checkpoint, got None")
+        raise ValueError("resume needs a folder to resume from: checkpoint must be a path, got None")
     return check_count("checkpoint_every", checkpoint_every)
 
 

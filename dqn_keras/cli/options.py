@@ -29,9 +29,6 @@ Flag = FlagCreatePairsOff[bool]
 Folder = Annotated[Positional[Path], arg(metavar="FOLDER")]
 
 
-Module = Annotated[str | None, arg(name="import", metavar="MODULE", help_behavior_hint="(default: none)")]
-
-
 @dataclasses.dataclass(frozen=True)
 class _Unchecked(Config):
     """The parameters as typed. Config checks them later, so that tyro puts no box around its messages."""
@@ -97,7 +94,7 @@ class _Kept:
 
 @dataclasses.dataclass(kw_only=True)
 class Resume(_Kept):
-    """Continue an interrupted or killed run, or make a run longer. The result is the same as without a break."""
+    """Continue an interrupted or killed run, or make a run longer: the same run, bit for bit, as without a break."""
 
     num_episodes: Annotated[int | None, arg(metavar="INT", help_behavior_hint="(default: as before)")] = None
     """Maximum number of episodes."""
@@ -152,7 +149,7 @@ class Study(_ManySeeds):
 
 @dataclasses.dataclass(kw_only=True)
 class Sweep(_ManySeeds):
-    """Make a study of each of several settings, to see which is better."""
+    """Compare several settings: train an agent for each of many seeds with each setting."""
 
     vary: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE,VALUE ...")]
     """Parameters to vary, and their values, such as tau=0.01,0.05 hidden_units=64,128x128 loss=mse,huber.

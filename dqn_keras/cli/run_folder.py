@@ -1,4 +1,4 @@
-"""The folder of a run on the command line: its files, and how a run starts and continues there."""
+"""The folder of a command-line run: its files, and how a run starts and continues in it."""
 
 import ast
 import contextlib

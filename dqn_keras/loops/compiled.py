@@ -20,7 +20,7 @@ from dqn_keras.checks.environments import Spaces
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
 from dqn_keras.environments import key_of_twin
-from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, packages
+from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, known_formulas
 from dqn_keras.loops.draws import (
     draw_bits,
     episode_key,
@@ -154,7 +154,7 @@ def _bind_program(
     numbers = _numbers(env, agent, config, [0.0] * _CAPACITY, 0)
     specs = [tf.TensorSpec(x.shape, x.dtype) for x in numbers]
     environment = key_of_twin(env)
-    known = packages(formulas)
+    known = known_formulas(formulas)
     return bind(
         make_program,
         specs,

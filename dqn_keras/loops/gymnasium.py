@@ -18,7 +18,7 @@ from dqn_keras.agent import Agent, DivergedError
 from dqn_keras.checks.environments import CheckedEnv
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
-from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, packages
+from dqn_keras.learn import DEFAULT_FORMULAS, Metrics, known_formulas
 from dqn_keras.loops.updates import checked_step, num_before_updates, sum_up
 from dqn_keras.metrics import Episode
 from dqn_keras.policy import epsilon_at, epsilon_greedy, epsilon_of_next_episode
@@ -155,8 +155,8 @@ def _bind_step(
         make_step,
         specs,
         agent.learner,
-        key=("update", packages(formulas), gives_weights),
-        has_own_parts=packages(formulas) is None,
+        key=("update", known_formulas(formulas), gives_weights),
+        has_own_parts=known_formulas(formulas) is None,
         jit_compile=config.jit_compile,
     )
     numbers = {tau: tf.constant([config.gamma, tau], tf.float32) for tau in (config.tau, 0.0)}

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and whose SHA-256 is checked when they are read."""
+"""Writes files whole or not at all, and checks their SHA-256 when it reads them."""
 
 import contextlib
 import hashlib
@@ -20,7 +20,7 @@ FORMAT = 6
 
 
 class DamagedError(ValueError):
-    """The error for a file that is not a whole checkpoint."""
+    """The error for a file that is damaged, or is not a checkpoint of this version."""
 
 
 def to_bytes(arrays: Mapping[str, Any], facts: dict[str, Any]) -> bytes:
@@ -63,7 +63,7 @@ def _read_array(content: bytes) -> np.ndarray:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a temporary path, whose file replaces `path` in one step when the block ends without an error."""
+    """Yields a temporary path; its file replaces `path` in one step when the block ends without an error."""
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         yield temporary

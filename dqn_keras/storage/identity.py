@@ -1,4 +1,4 @@
-"""The identity of a run: everything that must be equal for two runs to be the same, in a form for a file."""
+"""The identity of a run: everything that must be equal for two runs to count as the same, as JSON values."""
 
 import dataclasses
 import json
@@ -14,7 +14,7 @@ from dqn_keras._engine.tensorflow import keras, tf
 from dqn_keras.agent import Agent
 from dqn_keras.checks.formulas import Formulas
 from dqn_keras.config import Config
-from dqn_keras.learn import DEFAULT_FORMULAS, packages
+from dqn_keras.learn import DEFAULT_FORMULAS, known_formulas
 from dqn_keras.replay import Experience
 from dqn_keras.storage.parts import Part, check_can_be_imported, describe, source_of, words_for
 from dqn_keras.storage.versions import versions
@@ -51,7 +51,7 @@ def identity(
         ValueError: a function or class of the user has no name that can be imported.
     """
     given = {"q_network": q_network, "optimizer": optimizer}
-    if not packages(formulas):
+    if not known_formulas(formulas):
         given |= formulas._asdict()
     for name, part in given.items():
         check_can_be_imported(name, part)

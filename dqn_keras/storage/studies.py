@@ -32,7 +32,7 @@ def kept_in(
     Args:
         path: the file; None saves nothing.
         settings: the identity of each setting, by its name.
-        tasks: the tasks whose outcomes are wanted.
+        tasks: the tasks to find outcomes for.
     """
     if path is None:
         yield {}, lambda: None
