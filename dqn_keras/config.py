@@ -51,8 +51,8 @@ class Config:
     """Compile the learning step with XLA. Results are reproducible with and without it, but differ in the last bits."""
 
     num_steps: int | None = None
-    """Maximum number of environment steps of the run. An episode that this limit cuts short has the reward NaN, because
-    its full reward is unknown. None: only `num_episodes` limits the run."""
+    """Maximum number of environment steps of the run. None: only `num_episodes` limits it.
+    An episode that this limit cuts short has the reward NaN, because its full reward is unknown."""
     learning_starts: int = 0
     """Environment steps before the first update, all with random actions (Mnih et al. 2015, "replay start size")."""
     steps_count_from: Literal["episode", "run"] = "episode"
@@ -60,11 +60,11 @@ class Config:
     gradient_steps: int = 1
     """Gradient steps per update, each on a new batch."""
     gradient_steps_per_target: int = 1
-    """Gradient steps from one update of Q-hat to the next (C in Mnih et al. 2015, algorithm 1). With tau=1, each of
-    these updates makes Q-hat a copy of Q."""
+    """Gradient steps from one update of Q-hat to the next (C in Mnih et al. 2015, algorithm 1).
+    With tau=1, each of these updates makes Q-hat a copy of Q."""
     epsilon_steps: int | None = None
-    """Environment steps of the run over which epsilon falls linearly from `epsilon` to `epsilon_min`. None: epsilon is
-    multiplied by `decay` after each episode."""
+    """Environment steps of the run over which epsilon falls linearly from `epsilon` to `epsilon_min`.
+    None: epsilon is multiplied by `decay` after each episode."""
 
     def __post_init__(self) -> None:
         for name in _COUNTS:
