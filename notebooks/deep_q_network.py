@@ -6,14 +6,17 @@
 # the pole falls.
 #
 # In this notebook, a small neural network learns it by *Q-learning*, with the two ideas that made Q-learning work with
-# networks: a *replay memory* and a *target network*
-# ([Mnih et al. 2015](https://www.nature.com/articles/nature14236)). Each part is written out in a few lines, and a
-# check compares it with the package `dqn_keras`. Change a part, and see what happens.
+# networks: a *replay memory* and a *target network* ([Mnih et al. 2015](https://www.nature.com/articles/nature14236)).
+# Each part is written out in a few lines, and a check compares it with the package `dqn_keras`. The package reproduces
+# an older notebook, called *the original* here; the numbers in `Config()` are its numbers. Change a part, and see what
+# happens.
+#
+# You need to know Python, a little Keras, and what a gradient is; nothing of reinforcement learning.
+# [From a table to a network](from_a_table.ipynb) is a gentler start.
 #
 # The main path ends after "What it has learned" and takes about half an hour. The sections after it, "Going further",
 # take about a quarter of an hour more; you may skip any of them. (These are estimates: 200 words a minute, and one
-# minute for each code cell. Typing the code yourself takes longer.)
-# [From a table to a network](from_a_table.ipynb) is a gentler start. "S&B" is
+# minute for each code cell. Typing the code yourself takes longer.) "S&B" is
 # [Sutton and Barto's book](http://incompleteideas.net/book/the-book-2nd.html), second edition.
 
 # %%
@@ -23,8 +26,8 @@ os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # otherwise TensorFlow logs into the n
 os.environ["SDL_VIDEODRIVER"] = "dummy"  # pictures are drawn without a display
 
 # %% [markdown]
-# In Colab or Binder, the next cell installs the package from a copy of the repository. Where the package is installed,
-# it installs nothing.
+# The next cell installs the package if it is missing. (In Colab, first clone the repository and go to its folder
+# `notebooks` with `%cd`.)
 
 # %%
 import importlib.util
@@ -50,7 +53,9 @@ import tensorflow as tf
 # %% [markdown]
 # ## Parameters
 #
-# All numbers of the algorithm are in one object. The seed decides everything random: the same seed gives the same run.
+# All numbers of the algorithm are in one object. You need not understand them yet: most are explained where they are
+# used. `alpha` is the learning rate of the optimizer Adam. Those after `hidden_units` do not matter here. The seed
+# decides everything random: the same seed gives the same run.
 
 # %%
 config = Config()
@@ -80,6 +85,9 @@ print("reward:", reward, " terminated:", terminated, " truncated:", truncated)
 # %% [markdown]
 # ## What Q is
 #
+# This section is the theory. If a formula stops you, read only the text around it and go on: the code below needs just
+# the last two paragraphs.
+#
 # A *policy* $\pi$ says which action to take in each state. The *return* is the sum of all later rewards, in which a
 # reward $k$ steps ahead is multiplied by $\gamma^k$. The *action value* $Q^\pi(s, a)$ is the mean return after action
 # $a$ in state $s$, **if the policy $\pi$ acts from then on** (S&B, section 3.5):
@@ -91,7 +99,8 @@ print("reward:", reward, " terminated:", terminated, " truncated:", truncated)
 #
 # $$Q^*(s, a) = \mathbb{E} \bigl[\, r + \gamma \max_{a'} Q^*(s', a') \bigr]$$
 #
-# An action is worth its reward $r$, plus the discounted value of the best action $a'$ in the next state $s'$.
+# An action is worth its reward $r$, plus $\gamma$ times the value of the best action $a'$ in the next state $s'$.
+# ($\gamma$ is 0.95 here: a reward ten steps ahead counts $0.95^{10} \approx 60\,\%$.)
 #
 # If we knew $Q^*$, acting would be easy: take the action with the highest value, the *greedy* action. *Q-learning*
 # (S&B, section 6.5) starts with any $Q$ and moves $Q(s, a)$ towards the right side of that equation, again and again.
@@ -103,7 +112,7 @@ print("reward:", reward, " terminated:", terminated, " truncated:", truncated)
 #
 # The network takes a state and gives one value for each action. We keep **two** of them. $Q$ learns. $\hat Q$, the
 # *target network*, is a copy that follows $Q$ slowly, and $Q$ learns from its values. If $Q$ learned from its own
-# values, each step would also move what it learns from.
+# values, each learning step would also move the target, as if the goal ran away from the runner.
 
 # %%
 q_network, q_hat_network = make_networks(num_features=4, num_actions=2, hidden_units=config.hidden_units, seed=seed)
@@ -116,9 +125,12 @@ print("Q-hat:", q_hat_network(state[None]).numpy(), "(equal at the start)")
 # ## Experience
 #
 # One step of the environment is one *transition*: state, action, reward, next state, and whether the next state was
-# terminal. A batch of $B$ transitions has the same five fields, each with $B$ rows.
+# terminal. In code, the last is `terminal_state`, 1 or 0. A batch of $B$ transitions has the same five fields, each
+# with $B$ rows.
 #
 # Only *terminated* counts as terminal. If time ran out, the pole still stood, and the future was still worth something.
+#
+# Here is a batch of random numbers, to try out the next parts:
 
 # %%
 rng = np.random.default_rng(seed)
@@ -138,6 +150,8 @@ print("shapes of a made-up batch:", {name: values.shape for name, values in batc
 # terminal state there are no rewards, so its value is 0:
 #
 # $$y = \begin{cases} r & s' \text{ terminal} \\ r + \gamma \max_{a'} \hat Q(s', a') & \text{otherwise} \end{cases}$$
+#
+# (`q_network` is not used here. Other formulas need it, such as Double DQN's in the exercises.)
 
 
 # %%
@@ -156,7 +170,8 @@ for terminal, y in list(zip(batch.terminal_state, my_targets(*arguments)))[8:12]
 # ## The loss
 #
 # The *temporal-difference error* (TD error) $y - Q(s, a)$ says how much better or worse a step went than $Q$ had
-# expected. The loss is the mean of its square:
+# expected. The loss is the mean of its square over the batch; $\theta$ are the weights of $Q$, and $\hat\theta$ those
+# of $\hat Q$:
 #
 # $$L(\theta) = \frac{1}{B} \sum_{i=1}^{B} \bigl(y_i - Q(s_i, a_i; \theta)\bigr)^2$$
 
@@ -198,8 +213,9 @@ print("the same weights after the update")
 # ## One learning step
 #
 # One learning step does three things. It computes the gradient of the loss with respect to the weights of $Q$ alone,
-# takes one step of the optimizer, and makes one soft update. The check takes the same step with the package's `learn`,
-# from the same start, and compares all weights of both networks.
+# takes one step of the optimizer, and makes one soft update. A `GradientTape` records what is computed inside its
+# block, so that TensorFlow can differentiate it. The targets are computed outside: they count as fixed numbers. The
+# check takes the same step with the package's `learn`, from the same start, and compares all weights of both networks.
 
 
 # %%
@@ -250,11 +266,16 @@ np.testing.assert_allclose(my_decay(0.5), dqn_keras.decay_epsilon(0.5, config))
 print("20 actions at epsilon 0.5:", *mine)
 
 # %% [markdown]
+# Action 1 is greedy. On average, half of the actions are random, and half of these are 1, too. So about three in four
+# are 1 (here 15 of 20).
+
+# %% [markdown]
 # ## The replay memory
 #
-# Successive steps resemble each other, but a gradient step assumes samples that do not. So the last 50,000 transitions
-# are kept, and each learning step draws 64 of them at random. `ReplayMemory` is a table with one row for each
-# transition; when it is full, a new transition replaces the oldest.
+# Successive steps resemble each other. A network that learns them in order may forget the rest
+# ([From a table to a network](from_a_table.ipynb) shows an example), so batches should be mixed, as when training data
+# are shuffled. The last 50,000 transitions are kept, and each learning step draws 64 of them at random. `ReplayMemory`
+# is a table with one row for each transition; when it is full, a new transition replaces the oldest.
 
 # %%
 memory = ReplayMemory(config.memory_size, state_shape=(4,))
@@ -265,7 +286,10 @@ print("the first numbers of 10 sampled states:", memory.sample(10, rng).state[:,
 # %% [markdown]
 # ## Training
 #
-# All parts in their order. This is the whole algorithm:
+# All parts in their order. In each step, the agent acts and stores the transition. At every fourth step
+# (`steps_per_update`), it draws a batch and learns, as soon as the memory holds 64 transitions. After each episode,
+# $\varepsilon$ falls. (`state[None]` is a batch of one state; `[0]` takes the one row of the result.) This is the whole
+# algorithm:
 
 # %%
 from dqn_keras.seeding import acting_rng, episode_seed, weights_seed  # the same random numbers as `train`
@@ -325,15 +349,23 @@ print("The first 30 rewards are the same as yours.")
 # %% tags=["save-rewards"]
 ax = dqn_keras.plot_rewards(run.rewards, window=config.solved_window)
 _ = ax.axhline(config.solved_reward, color="gray", linestyle=":")
+for k in (50, 100, 150, 200, 250):
+    print(f"mean of the last 50 rewards after {k} episodes: {run.rewards[k - 50 : k].mean():.0f}")
 
 # %% [markdown]
-# For about 170 episodes nothing seems to happen. The mean even sinks from 20 steps to 14. Then the curve climbs, though
-# not smoothly. The dotted line is the bar of 225.
+# For about 170 episodes nothing seems to happen; the mean even sinks from 19 to 15. (The log prints the mean of the
+# last 100 rewards; the curve is the mean of the last 50.) Then the curve climbs, though not smoothly. The dotted line
+# is the bar of 225.
 #
 # The original notebook reports its run as solved in 293 episodes. That is one seed, and so is this one.
 #
-# `train` also takes your formula for the targets. With the same formula, it is the same run. Now change `my_targets`
-# above, run its cell (its check then fails) and the next cell, and see what happens.
+# `train` also takes your formula for the targets. With the same formula, it is the same run.
+#
+# Now break it. In "The targets", leave out `(1 - terminal_states) *` and run that cell; its check fails, as it should.
+# Then come back and run the cell below. What do you expect? (A run that does not learn goes on for 2,000 episodes;
+# `verbose=1` shows how far it is.) Afterwards, repair it and run its cell again.
+#
+# We tried it with `Config(num_episodes=400)`: it is not solved, and its last 50 episodes have 10 steps on average.
 
 # %%
 own_run = train(env, config, seed, targets=my_targets, verbose=0)
@@ -353,6 +385,11 @@ print(
     f"rewards of a greedy episode: mean {returns.mean():.1f}, lowest {returns.min():.0f}, highest {returns.max():.0f}"
 )
 print(f"mean of the last 50 training episodes: {run.rewards[-50:].mean():.1f}")
+print(f"epsilon of the last episode: {run.history['epsilon'][-1]:.2f}")
+
+# %% [markdown]
+# In training, nearly one action in four was still random at the end. And the mean is over 50 episodes, in which the
+# network went on learning.
 
 # %% [markdown]
 # Three policies from the same start. From left to right: random pushes, a rule written by hand (push to the side to
@@ -386,8 +423,8 @@ side_by_side = [np.hstack([np.pad(frame, ((0, 0), (0, 4), (0, 0))) for frame in 
 dqn_keras.animate(side_by_side, fps=25, width=660)
 
 # %% [markdown]
-# The rule by hand needs no learning, but it needs someone who knows what the four numbers mean. The network has found
-# its own rule from rewards alone.
+# From this start, the rule by hand is even better: 500 steps, and the network's cart leaves the track after 480. But
+# the rule needs someone who knows what the four numbers mean. The network has found its own rule from rewards alone.
 #
 # **Here the main path ends.** Where to go from here:
 #
@@ -405,8 +442,9 @@ dqn_keras.animate(side_by_side, fps=25, width=660)
 # %% [markdown]
 # ### Why does the loss rise?
 #
-# Does the loss fall if the same batch is learned again and again? Here are 1,000 steps, once with the soft update and
-# once with a $\hat Q$ that stays as it is ($\tau = 0$).
+# In this run, the loss rises for most of the training (second panel below). How can that be, if the agent learns? First
+# a simpler question: does the loss fall if the same batch is learned again and again? Here are 1,000 steps, once with
+# the soft update and once with a $\hat Q$ that stays as it is ($\tau = 0$).
 
 # %%
 for tau in (0.0, config.tau):
@@ -418,8 +456,9 @@ for tau in (0.0, config.tau):
 # With fixed targets, the loss falls towards 0. With the soft update, the targets move while $Q$ learns them: the loss
 # falls, rises and falls again. So a rising loss need not mean that something is wrong.
 #
-# The next panels show what the run recorded for each episode. The last one shows how old the experience is from which
-# the agent learns.
+# The next panels show what the run recorded for each episode. "TD error" is its mean size, without the sign. After
+# about 170 episodes, they become longer. So the share of terminal transitions in the memory falls, and so does the
+# median age (in episodes) of the experience from which the agent learns.
 
 
 # %%
@@ -451,9 +490,10 @@ for k in (50, 100, 200, run.solved_at):
     print(f"episode {k}: loss {history['loss'][k]:.2f}, TD error {share:.0%} of the mean of max Q")
 
 # %% [markdown]
-# **The loss does not tell how well the agent acts.** It rises while the rewards stay low, and goes on rising for most
-# of their climb. Meanwhile $Q$ grows towards 20, the highest possible value:
-# $\sum_k \gamma^k \cdot 1 = 1 / (1 - 0.95) = 20$. Relative to $Q$, the TD error falls.
+# **The loss does not tell how well the agent acts.** It falls for about 25 episodes. Then it rises while the rewards
+# stay low, and goes on rising for most of their climb. (Single episodes are noisy, as the printed ones: look at the
+# curve.) Meanwhile $Q$ grows towards 20, the highest possible value: $\sum_k \gamma^k \cdot 1 = 1 / (1 - 0.95) = 20$.
+# Relative to $Q$, the TD error falls.
 
 # %% [markdown]
 # ### What does Q believe?
@@ -478,7 +518,8 @@ for ax in axes[:, 0]:
 # %% [markdown]
 # The colour bars show how the values grow. When the pole moves to the right, the cart has to move to the right, too.
 # For 100 episodes, the network pushes the wrong way in most of these states; at 150, it pushes left nearly everywhere.
-# At 200, the two sides are right. In the end, the values also tell safe states from lost ones.
+# At 200, the two sides are right. In the end, the values also tell safe states (the bright band) from lost ones (the
+# dark corners: the pole leans to one side and moves further that way).
 
 # %% [markdown]
 # ### Is Q right?
@@ -557,8 +598,12 @@ assert outcome["preset, gamma 0.99"].greedy_returns.mean() > 450
 # interval says where the mean over all seeds probably lies.
 #
 # With the original's other numbers, a larger $\gamma$ alone makes no difference that can be seen. With the preset's, it
-# does: 0.99 plays nearly to the end, 0.95 does not. So $\gamma$ is a part of the reason, but not the only one. (Over
-# 500 seeds, it helps a little with the original's numbers, too: [results/ablation.md](../results/ablation.md).)
+# makes a large one: 0.99 plays nearly to the end, and 0.95 plays worse than the original. So $\gamma$ matters, but its
+# effect depends on the other numbers. (Over 500 seeds, it helps a little with the original's numbers, too:
+# [results/ablation.md](../results/ablation.md).)
+#
+# The table shows rewards only: it does not say which episodes ended at the edge of the track. Exercise 8 of
+# [Exercises](exercises.ipynb) counts them.
 
 # %% [markdown]
 # ### What does the climb wait for?
@@ -566,8 +611,11 @@ assert outcome["preset, gamma 0.99"].greedy_returns.mean() > 450
 # What made the rewards climb after 170 episodes: that the memory held enough, or that the network had learned often
 # enough? Over a hundred seeds, the climb does not come earlier if the memory already holds 5,000 random transitions.
 # With more frequent updates it does: with one at every 1, 2, 4 or 8 steps, the curve climbs after 83, 114, 186 or 359
-# episodes. (These are medians, from [results/climb.md](../results/climb.md), by `python -m benchmarks.climb`. With
-# $\varepsilon = 0.1$ from the start, those random transitions do help: 259 episodes instead of 384.)
+# episodes. So here the climb waits for learning, not for a fuller memory.
+#
+# This holds with $\varepsilon$ falling from 1. With $\varepsilon = 0.1$ from the start, the random transitions do help:
+# 259 episodes instead of 384. (All are medians, from [results/climb.md](../results/climb.md), by
+# `python -m benchmarks.climb`.)
 
 # %% [markdown]
 # ### What can go wrong?

@@ -160,8 +160,8 @@ def play(q, state):
 #
 # `CartPole()` is the environment of the lesson, written so that whole episodes can be compiled. The first run compiles
 # for some seconds. After that, a run takes a fraction of a second, so you can train *many seeds*. A seed decides
-# everything random in a run: the network's first weights, the starts, the random actions, the batches. Change the seed
-# below and look at the numbers.
+# everything random in a run: the network's first weights, the starts, the random actions, the batches. Change `seed=1`
+# and look at the first run; `study` always trains the seeds 0 to 9. A seed that is not solved counts as 2,000.
 
 # %%
 run = train(CartPole(), Config(), seed=1)
@@ -186,7 +186,8 @@ print("episodes until it is solved, seed by seed:", outcome.episodes_to_solved.a
 # per transition, one column per action. `tf.reduce_max(values, axis=-1)` gives the highest value of each row.
 # `terminal_states` is 1 where $s'$ is terminal, else 0.
 #
-# The check compares your targets of six transitions with those of the package, and compiles your function.
+# `q_network` is not used here; Double DQN (exercise 4) needs it. The check compares your targets of six transitions
+# with those of the package, and compiles your function.
 
 
 # %% tags=["student"]
@@ -260,8 +261,9 @@ prediction = "more"
 # ```
 #
 # Call the settings `"tau 0.01"` and `"tau 1"`. Both have `num_episodes=500`, since a run that is longer is late. Change
-# nothing else but `tau`. This is the longest computation of the notebook. The check looks at names, settings and number
-# of seeds, and prints the results. It accepts any prediction.
+# nothing else but `tau`. This takes about half a minute on one core; `verbose=1` shows a bar. The check looks at names,
+# settings and number of seeds, and prints the results. It accepts any prediction. Write one sentence about what you
+# see. Then compare it with "What it shows" in [the solutions](exercises_solutions.ipynb).
 
 # %% tags=["student"]
 by_tau = None  # your code here
@@ -294,7 +296,8 @@ def _():
     difference = compare(found["tau 0.01"], found["tau 1"]).difference
     print("median with tau 1 minus median with tau 0.01:", difference)
     print("In brackets are 95 % intervals: they say where the number for all seeds probably lies.")
-    return f"You predicted {predicted!r}. Where two intervals overlap, more seeds are needed to see a difference."
+    print("If the interval of the difference contains 0, these seeds do not show which median is lower.")
+    return f"You predicted {predicted!r}. If the intervals of the two late shares overlap, more seeds may be needed."
 
 
 # %% [markdown] tags=["solution"]
@@ -386,7 +389,8 @@ def _():
 # %% [markdown]
 # What is the memory good for? Make it so small that every batch holds only the last 64 transitions: set `small_memory`
 # to the `study` of `Config(memory_size=64)` with ten seeds. The cell after it compares its episodes to solved with
-# those of the warm-up. What changes, and by how much?
+# those of the warm-up. What changes, and by how much? Write one sentence about what you see. Then compare it with "What
+# it shows" in [the solutions](exercises_solutions.ipynb).
 
 # %% tags=["student"]
 small_memory = None  # your code here: study(CartPole(), Config(...), seeds=range(10), verbose=0)
@@ -406,7 +410,8 @@ if small_memory is not None:
 # %% [markdown]
 # ## 4. Double DQN (15 minutes)
 #
-# The maximum over noisy values is too high on average: it picks what the noise has lifted. Look at five actions that
+# The values of a network are estimates: the right values plus errors, like noise. The maximum over noisy values is too
+# high on average, since it picks what the noise has lifted. The targets take such a maximum. Look at five actions that
 # are all worth exactly 0. `first` are noisy values of them. `second` are values with other noise, a second opinion;
 # `correlation` says how much the second noise resembles the first.
 

@@ -31,13 +31,13 @@ print("\n".join(" ".join(row) for row in field))
 # %% [markdown]
 # ## The table
 #
-# $Q(s, a)$ is what one can expect after action $a$ in state $s$, if the best actions follow: the sum of all later
-# rewards. A later reward counts less, by a factor $\gamma$ for each step. There are 16 states and 4 actions, so $Q$ is
-# a table of 64 numbers. At the beginning all are 0.
+# $Q(s, a)$ is the sum of rewards that one can expect from action $a$ in state $s$ on, if the best actions follow. The
+# reward of $a$ itself counts fully; each later one counts less, by a factor $\gamma$ for each step. There are 16 states
+# and 4 actions, so $Q$ is a table of 64 numbers. At the beginning all are 0.
 #
 # Each step gives a better guess of one of them. The step leads from state $s$ with action $a$ to state $s'$ and gives
-# the reward $r$. The guess is the reward, plus the discounted value that the table gives to $s'$. If $s'$ is terminal,
-# nothing follows, and the guess is $r$ alone.
+# the reward $r$. The guess is the reward, plus $\gamma$ times the highest number in the row of $s'$ (the *discounted*
+# value of $s'$). If $s'$ is terminal, nothing follows, and the guess is $r$ alone.
 #
 # $$y = r + \gamma \max_{a'} Q(s', a') \qquad\qquad Q(s, a) \leftarrow Q(s, a) + \alpha \, \bigl(y - Q(s, a)\bigr)$$
 #
@@ -104,7 +104,8 @@ print("the goal is reached for the first time in episode", next(n for n, q in en
 # %% [markdown]
 # For a long time there is nothing to learn from: the agent finds the goal by chance alone. Then the values spread from
 # the goal backwards, since a cell can only learn from the cells that follow it. In the end they say how far the goal
-# is: a cell that is $k$ steps away from it has the value $\gamma^{k-1}$. The start is six steps away. Its value:
+# is: a cell that is $k$ steps away from it has the value $\gamma^{k-1}$. (The top right cell is not quite there: 0.65,
+# where $0.9^4 = 0.66$. With 2,000 episodes, it is.) The start is six steps away. Its value:
 
 # %%
 q = tables[-1]
@@ -146,12 +147,15 @@ for name, lake, step in (("firm ice", env, 0.5), ("slippery ice", slippery, 0.5)
 # one row: the kernel *is* the table.
 #
 # Then the update above is one step of gradient descent on the squared error $(y - Q(s, a))^2$. The derivative with
-# respect to $Q(s, a)$ is $-2 \, (y - Q(s, a))$; with respect to all other numbers of the table it is 0. So the learning
-# rate is $\alpha / 2$. ($y$ counts as a fixed number, although $Q$ is in it.)
+# respect to $Q(s, a)$ is $-2 \, (y - Q(s, a))$; with respect to all other numbers of the table it is 0. A step with
+# learning rate $\eta$ adds $2 \eta \, (y - Q(s, a))$. With $\eta = \alpha / 2$, that is the update of the table. ($y$
+# counts as a fixed number, although $Q$ is in it.)
 #
 # From here on, $y$ comes from the package's function `td_targets`. Its arguments are a batch of steps, $\gamma$, and
-# two networks: $Q$, and $\hat Q$, which gives the values of the next states. Here, both are the same network. The end
-# of this notebook shows what a second one is good for. `make_q_network` makes a network with hidden layers.
+# two networks: $Q$, and $\hat Q$, which gives the values of the next states. The targets need only $\hat Q$, so
+# `target` passes it twice. Until the end of this notebook, $\hat Q$ is the network that learns; there, we see what a
+# second one is good for. `make_q_network` makes a network with hidden layers. A `GradientTape` records what is computed
+# inside its block, so that TensorFlow can differentiate it; `tf.function` only makes it faster.
 
 # %%
 from dqn_keras import make_q_network, td_targets
@@ -219,7 +223,8 @@ np.testing.assert_array_equal(kernel, table)
 # In CartPole, the task of the lesson, a state is four real numbers. A table would need a row for each state, and hardly
 # a state comes twice. A network with a hidden layer gives values also for states that it has never seen, because
 # **states share weights**. The price: an update of one state changes the values of others. Here both networks learn the
-# step from cell 14 to the goal, ten times:
+# step from cell 14 to the goal, ten times. (The one without a hidden layer is the one from above. It has nearly learned
+# this step already, so its number changes little.) Look at the *other* numbers:
 
 
 # %%
@@ -303,5 +308,6 @@ show_targets("a hidden layer and Q-hat", other, frozen, 0.1)
 # this target does not move.
 #
 # DQN adds two ideas to Q-learning, one for each difficulty: a **replay memory**, from which the steps are drawn in
-# random order, and a **target network**, the copy. The lesson, [deep_q_network.ipynb](deep_q_network.ipynb), builds
-# both, for a task with too many states for a table.
+# random order, and a **target network**, the copy. (Whether a task needs both is a question for measurements:
+# [Does it need this?](does_it_need_this.ipynb).) The lesson, [deep_q_network.ipynb](deep_q_network.ipynb), builds both,
+# for a task with too many states for a table.
