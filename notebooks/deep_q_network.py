@@ -599,7 +599,7 @@ assert outcome["preset, gamma 0.99"].greedy_returns.mean() > 450
 #
 # With the original's other numbers, a larger $\gamma$ alone makes no difference that can be seen. With the preset's, it
 # makes a large one: 0.99 plays nearly to the end, and 0.95 plays worse than the original. So $\gamma$ matters, but its
-# effect depends on the other numbers. (Over 500 seeds, it helps a little with the original's numbers, too:
+# effect depends on the other numbers. (Over a thousand seeds, it helps a little with the original's numbers, too:
 # [results/ablation.md](../results/ablation.md).)
 #
 # The table shows rewards only: it does not say which episodes ended at the edge of the track. Exercise 8 of

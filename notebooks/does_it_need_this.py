@@ -110,7 +110,7 @@ for name, study in outcome.items():
 # Where two intervals overlap widely, a hundred seeds do not show which setting is better.
 #
 # - **No target network**: the trained networks play better, and the median is lower. On this task, the slow copy is no
-#   help. (More seeds are solved, too: over 500 seeds, that difference is clear,
+#   help. (More seeds are solved, too: over a thousand seeds, that difference is clear,
 #   [results/ablation.md](../results/ablation.md).)
 # - **No replay**: three of four seeds are not solved by episode 500. Replay seems to be the part that matters most.
 # - **Neither**: a surprise. If only replay is missing, 24 of 100 seeds are solved; if the slow target is missing, too,

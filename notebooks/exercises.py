@@ -481,7 +481,7 @@ def _():
 
 
 # %% [markdown]
-# Does Double DQN help on CartPole? A sweep over 500 seeds shows no difference
+# Does Double DQN help on CartPole? A sweep over a thousand seeds shows no difference
 # ([results/ablation.md](../results/ablation.md)). Note that $\hat Q$ is a late copy of $Q$, not an independent opinion.
 
 # %% [markdown]
