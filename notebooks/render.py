@@ -63,7 +63,12 @@ def render(source: Path) -> list[Path]:
     notebook = list(notebooks.values())[-1]
     metadata = copy.deepcopy(notebook.metadata)
     NotebookClient(
-        notebook, timeout=3600, record_timing=False, coalesce_streams=True, resources={"metadata": {"path": NOTEBOOKS}}
+        notebook,
+        timeout=3600,
+        record_timing=False,
+        coalesce_streams=True,
+        resources={"metadata": {"path": NOTEBOOKS}},
+        extra_arguments=["--log-level=ERROR"],  # the kernel warns of its own way to talk to this process
     ).execute()
     notebook.metadata = metadata  # without the versions that the run has put in
     for cell in notebook.cells:
