@@ -202,7 +202,9 @@ def test_the_warning_of_many_compilations_says_what_has_changed(learning):
     for held.num_calls in range(7):
         learning(loss=loss)
     held.num_calls = 7
-    with pytest.warns(UserWarning, match=r"compiled 8 times .*, the last time because of num_calls of SimpleNamespace, which"):
+    with pytest.warns(
+        UserWarning, match=r"compiled 8 times .*, the last time because of num_calls of SimpleNamespace, which"
+    ):
         learning(loss=loss)
 
 
