@@ -39,8 +39,10 @@ coverage: .venv/has-dev
 	$(BIN)/coverage combine --quiet
 	$(BIN)/coverage report
 
+# Outside of a git repository, the checks that need no list of its files.
 lint: .venv/has-dev
-	$(BIN)/pre-commit run --all-files
+	if git rev-parse --git-dir > /dev/null 2>&1; then $(BIN)/pre-commit run --all-files; \
+	else $(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy; fi
 
 format: .venv/has-dev
 	$(BIN)/ruff check --fix .
