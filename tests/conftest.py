@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 os.environ.setdefault("DQN_KERAS_CACHE", "0")  # tests leave nothing in the user's folders
+importlib.import_module("dqn_keras.learn")  # before a test imports Keras, as the cache needs it
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a background job; tests and their processes are interrupted
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

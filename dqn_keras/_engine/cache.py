@@ -2,7 +2,8 @@
 
 TensorFlow can keep such a cache, but it trusts every file in the folder and writes files in place. So each process gets
 its own folder, with copies of the files in the shared folder. Before a file is copied, it is checked by the SHA-256 in
-its name. `publish` moves new files to the shared folder.
+its name. `publish` moves new files to the shared folder. TensorFlow finds a program by its contents and by the names in
+it; `programs.py` names everything in the same way in each process.
 
 This module does not import TensorFlow, because TensorFlow reads the setting at its import.
 """
@@ -24,6 +25,7 @@ from dqn_keras._engine.machine import processor
 
 _OPTION = "--tf_xla_persistent_cache_directory="
 _MOST_FILES = 100  # of about 1.5 MB each
+_SMALLEST = 100_000  # bytes; smaller programs are compiled at once, and TensorFlow gives them other names each time
 _A_DAY = 24 * 60 * 60  # the folder of a killed process is deleted after this time
 
 
@@ -73,7 +75,7 @@ def publish() -> None:
         return
     with contextlib.suppress(OSError):  # a full disk, or another process has deleted the file
         for path in _own.glob("*.pb"):
-            if not list(_own.parent.glob(f"{path.name}.*")):
+            if path.stat().st_size >= _SMALLEST and not list(_own.parent.glob(f"{path.name}.*")):
                 os.replace(path, _own.parent / f"{path.name}.{_digest(path)}")
         oldest_first = sorted(_own.parent.glob("*.pb.*"), key=lambda path: path.stat().st_mtime)
         for path in oldest_first[:-_MOST_FILES]:

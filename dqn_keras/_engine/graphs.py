@@ -1,4 +1,4 @@
-"""Digests of what a traced function computes, independent of the names in it."""
+"""What a traced function computes, independent of the names that TensorFlow and Keras gave to its parts."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
@@ -52,6 +52,72 @@ def fingerprint(concrete: Any) -> str:
     return digest.hexdigest()
 
 
+def renamed(concrete: Any, name: str) -> list[Any]:
+    """Returns the FunctionDefs of a ConcreteFunction and of the functions that it calls, with names of our own.
+
+    The first is called `name`, and the others get a number in the order of first use. So the same code traced in
+    another process gives the same FunctionDefs, and XLA's cache on disk, which includes the names, has its program.
+    """
+    library = {function.signature.name: function for function in _functions(concrete)}
+    numbers = {concrete.function_def.signature.name: 0}
+    functions: list[Any] = []
+    while len(functions) < len(numbers):  # the dict grows inside the loop
+        functions.append(_renamed(library[list(numbers)[len(functions)]], numbers, name))
+    return functions
+
+
+def _renamed(function: Any, numbers: dict[str, int], prefix: str) -> Any:
+    new = type(function)()
+    new.CopyFrom(function)
+    names = {x.name: f"argument_{i}" for i, x in enumerate(new.signature.input_arg)}
+    names |= {x.name: f"{x.op}_{i}" for i, x in enumerate(new.node_def)}
+    outputs = {x.name: f"output_{i}" for i, x in enumerate(new.signature.output_arg)}
+
+    def reference(text: str) -> str:  # "NAME", "NAME:OUTPUT:INDEX", or "^NAME"
+        caret = text[: text.startswith("^")]
+        name, colon, output = text[len(caret) :].partition(":")
+        return caret + names[name] + colon + output
+
+    def rename_in(attributes: Any) -> None:
+        for key in sorted(attributes):
+            if key in _NAMES:
+                del attributes[key]
+                continue
+            for called in _called(attributes[key]):
+                called.name = numbered(called.name)
+                rename_in(called.attr)
+
+    def numbered(name: str) -> str:
+        number = numbers.setdefault(name, len(numbers))
+        return f"{prefix}_{number}" if number else prefix
+
+    new.signature.name = numbered(new.signature.name)
+    for x in (*new.signature.input_arg, *new.node_def):
+        x.name = names[x.name]
+    for x in new.signature.output_arg:
+        x.name = outputs[x.name]
+    for node in new.node_def:
+        node.input[:] = map(reference, node.input)
+        node.ClearField("experimental_debug_info")
+    for attributes in (*(node.attr for node in new.node_def), *(x.attr for x in new.arg_attr.values()), new.attr):
+        rename_in(attributes)
+    new.ret.clear()
+    new.ret.update({outputs[key]: reference(value) for key, value in function.ret.items()})
+    new.control_ret.clear()
+    new.control_ret.update({names[x]: names[x] for x in function.control_ret.values()})
+    new.signature.control_output[:] = sorted(new.control_ret)
+    return new
+
+
+_NAMES = ("_gradient_op_type", "_class", "_user_specified_name")
+"""Attributes that hold names: of an operation's gradient, of operations beside it, and of an argument."""
+
+
+def _called(attribute: Any) -> list[Any]:
+    """Returns the functions that an attribute names."""
+    return [attribute.func] if attribute.HasField("func") else list(attribute.list.func)
+
+
 def _functions(concrete: Any) -> list[Any]:
     """Returns the FunctionDefs of the function and of all functions that it may call."""
     return [concrete.function_def, *concrete.graph.as_graph_def().library.function]
@@ -77,12 +143,10 @@ def _parts(function: Any, numbers: dict[str, int]) -> Iterator[Any]:
 
 def _attributes(attributes: Any, numbers: dict[str, int]) -> Iterator[Any]:
     for name in sorted(attributes):
-        value = attributes[name]
-        functions = [value.func] if value.HasField("func") else list(value.list.func)
-        if functions:
+        if functions := _called(attributes[name]):
             yield (
                 name,
                 [(numbers.setdefault(f.name, len(numbers)), list(_attributes(f.attr, numbers))) for f in functions],
             )
-        elif name not in ("_gradient_op_type", "_class"):  # the names of the op's gradient, and of ops beside it
-            yield name, value.SerializeToString(deterministic=True)
+        elif name not in _NAMES:
+            yield name, attributes[name].SerializeToString(deterministic=True)

@@ -27,24 +27,33 @@ def can_swap_variables() -> bool:
         return False
 
 
-def caller(concrete: Any) -> Callable[..., list[tf.Tensor]]:
+def caller(concrete: Any, functions: Sequence[Any] = ()) -> Callable[..., list[tf.Tensor]]:
     """Returns a ConcreteFunction as a function of its arguments and of all its captured tensors.
 
     A call of the ConcreteFunction itself first binds the arguments to a signature, which takes half as long as a
     learning step. Its `call_flat` reads TensorFlow's options at each call, which takes another fifth.
+
+    Args:
+        concrete: the function.
+        functions: FunctionDefs that compute the same and are called instead: the first is the function, the others are
+            those that it calls. They are never freed.
     """
     function = concrete.inference_fn
     try:
         from tensorflow.python.eager import context, execute
 
         eager = context.context()
+        for definition in functions:
+            eager.add_function_def(definition)
         options = tuple(itertools.chain(*eager.function_call_options.as_attrs().items()))
-        name, num_outputs = function.name.decode(), len(function.function_type.flat_outputs)
+        name = functions[0].signature.name if functions else function.name.decode()
+        num_outputs = len(function.function_type.flat_outputs)
         run = execute.execute
     except (ImportError, AttributeError):
         return function.call_flat
-    # TensorFlow frees a function with its last reference; `_kept` holds one.
-    return lambda *tensors, _kept=function: run(name, num_outputs, list(tensors), options, eager)
+    # TensorFlow frees a traced function with its last reference; `_kept` holds one.
+    kept = None if functions else function
+    return lambda *tensors, _kept=kept: run(name, num_outputs, list(tensors), options, eager)
 
 
 def tensor_maker() -> Callable[[np.ndarray], tf.Tensor]:

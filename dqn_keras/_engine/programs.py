@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from dqn_keras._engine.graphs import fingerprint
+from dqn_keras._engine.graphs import fingerprint, renamed
 from dqn_keras._engine.layers import FewInputsDense, FewOutputsDense
 from dqn_keras._engine.made_here import units_if_made_here
 from dqn_keras._engine.private import (
@@ -130,7 +130,7 @@ _shared: dict[Hashable, _Program] = {}
 _of_this_study: dict[Hashable, _Program] | None = None
 
 
-_compiled: dict[Hashable, Any] = {}
+_compiled: dict[Hashable, Callable[..., list[tf.Tensor]]] = {}
 """All traced functions, by fingerprint: the code that XLA compiled for them stays in memory anyway."""
 
 
@@ -230,8 +230,11 @@ def _trace(
     concrete = _traced(make_function(learner, variables), specs, jit_compile)
     numbers = {id(handle): i for i, handle in enumerate(_handles(learner, variables))}
     captured = [numbers.get(id(x), x) for x in concrete.captured_inputs]
-    concrete = _compiled.setdefault((fingerprint(concrete), jit_compile), concrete)
-    return _Program(caller(concrete), captured)
+    digest = fingerprint(concrete)
+    if (digest, jit_compile) not in _compiled:
+        functions = renamed(concrete, f"dqn_keras_{digest}") if jit_compile else ()
+        _compiled[digest, jit_compile] = caller(concrete, functions)
+    return _Program(_compiled[digest, jit_compile], captured)
 
 
 def _traced(function: Callable, specs: Sequence, jit_compile: bool) -> Any:

@@ -47,15 +47,18 @@ def _set_up_xla() -> None:
     """Sets how XLA compiles in this process, unless the user has.
 
     XLA compiles a small loop into one function. An undocumented option raises the limit for this from 1 to 100 kB,
-    which makes compiled episodes about 1.2 times as fast, with identical results.
+    which makes compiled episodes about 1.2 times as fast, with identical results. XLA reads its options when it
+    compiles for the first time.
 
     DQN_KERAS_CACHE is 1 for a cache of compiled programs in the user's cache folder, 0 for no cache, or a folder for
-    the cache. Notebooks and the command line have a cache by default.
+    the cache. Notebooks and the command line have a cache by default. If TensorFlow was imported before the package,
+    there is none: TensorFlow would log errors at each program that it reads.
     """
     if "xla_backend_extra_options" not in (flags := os.environ.get("XLA_FLAGS", "")):
         option = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000"
         os.environ["XLA_FLAGS"] = f"{flags} {option}".strip()
-    use_cache(os.environ.get("DQN_KERAS_CACHE", "1" if "ipykernel" in sys.modules else "0"))
+    if "tensorflow" not in sys.modules:
+        use_cache(os.environ.get("DQN_KERAS_CACHE", "1" if "ipykernel" in sys.modules else "0"))
 
 
 def require_tensorflow_backend(name: str) -> None:
@@ -70,8 +73,7 @@ def require_tensorflow_backend(name: str) -> None:
 # If pygame opens a window with OpenGL, a process with TensorFlow crashes: each of the two loads its own LLVM.
 os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
 require_tensorflow_backend(os.environ.get("KERAS_BACKEND", "tensorflow"))
-if "tensorflow" not in sys.modules:
-    _set_up_xla()
+_set_up_xla()
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # errors still show
 with _native_stderr_silenced(), _no_garbage_collection():
     import keras
