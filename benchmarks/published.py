@@ -283,6 +283,7 @@ A high p does not prove that the two are equal: with so few seeds, only large di
     }
     for title, measure in measures.items():
         print_table(title, records, measure)
+    print_starts(records)
     print_cleanrl(returns_of(records, "dqn_keras_cleanrl", "CartPole-v1", "training_return"))
     print(DIFFERENCES)
 
@@ -298,6 +299,25 @@ def print_table(title: str, records: list[Record], measure: str) -> None:
         for program in ("dqn_keras_torch_start", "dqn_keras"):
             ours = returns_of(records, program, settings.environment, measure)
             cells += [show(ours), equality(theirs, ours)]
+        print("|", " | ".join(cells), "|")
+    print()
+
+
+def print_starts(records: list[Record]) -> None:
+    """Prints whether this package's two starts differ: the same program and settings, only other initial weights."""
+    print("""## What the initial weights change
+
+"torch's start" against "Keras' start", the p-values of the same two tests. Nothing else differs between the two.
+
+| | 100 greedy episodes after training | training |
+|---|---|---|""")
+    for settings in ZOO:
+        cells = [settings.environment]
+        for measure in ("greedy_return", "training_return"):
+            programs = "dqn_keras_torch_start", "dqn_keras"
+            cells.append(
+                equality(*(returns_of(records, program, settings.environment, measure) for program in programs))
+            )
         print("|", " | ".join(cells), "|")
     print()
 

@@ -87,6 +87,7 @@ def test_its_draws_actions_and_updates_replayed_step_by_step_through_learn_agree
     config, agent = run.config, make_agent((4,), 2, run.config, 0)
     rows, num_steps, epsilon, updates = run.agent.memory.rows, 0, config.epsilon, 0
     n, batch_size = config.steps_per_update, config.batch_size
+    draw, sample, q_function = (tf.function(x) for x in (draw_bits, sample_indices, agent.q_network))
     close_calls = 0
     for number, episode in enumerate(transitions(run)):
         key = episode_key(tf.constant(draws_key(0)), tf.constant(number))
@@ -94,27 +95,27 @@ def test_its_draws_actions_and_updates_replayed_step_by_step_through_learn_agree
         for t, a in enumerate(episode.action, start=first):
             turn, j = (t + n - 1) // n, (t + n - 1) % n
             if j == 0 or t == first:
-                bits = draw_bits(2 * n + batch_size, key, turn)
+                bits = draw(2 * n + batch_size, key, tf.constant(turn)).numpy()
+                uniform, integer = to_uniform(bits).numpy(), to_integer(bits, 2).numpy()
             if config.epsilon_steps:
                 epsilon = 1 - 0.9 * min(1, num_steps / config.epsilon_steps)
             if num_steps < config.learning_starts:
                 epsilon = 1
             if t == first:
                 assert run.episodes[number].epsilon == pytest.approx(epsilon)
-            if to_uniform(bits)[j] < np.float32(epsilon):
-                assert a == to_integer(bits, 2)[n + j]
+            if uniform[j] < np.float32(epsilon):
+                assert a == integer[n + j]
             else:
-                q_values = agent.q_network(episode.state[t - first][None]).numpy()[0]
+                q_values = q_function(tf.constant(episode.state[t - first][None])).numpy()[0]
                 close_calls += a != q_values.argmax()
                 assert q_values[a] >= q_values.max() - 1e-3
             num_steps += 1
             if t % n == 0 and num_steps >= batch_size and num_steps > config.learning_starts:
                 for k in range(config.gradient_steps):
-                    counter, draws = turn, bits[2 * n :]
+                    counter, draws = tf.constant(turn + k * 2**44, tf.int64), tf.constant(bits[2 * n :])
                     if config.gradient_steps > 1:
-                        counter = turn + k * 2**44
-                        draws = draw_bits(batch_size, key, counter)
-                    indices = sample_indices(draws, key, counter, num_steps, config.memory_size).numpy()
+                        draws = draw(batch_size, key, counter)
+                    indices = sample(draws, key, counter, tf.constant(num_steps), config.memory_size).numpy()
                     updates += 1
                     tau = config.tau if updates % config.gradient_steps_per_target == 0 else 0
                     learn(unpack(rows[indices], (4,)), config.gamma, *agent.learner, tau=tau)
