@@ -3,7 +3,8 @@
 # make test-lowest: the fast tests with the lowest versions that pyproject.toml allows, and on newer Pythons.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt
+INSTALL := -m pip install --no-compile --disable-pip-version-check
+PIP := $(BIN)/python $(INSTALL) --constraint constraints.txt
 
 .PHONY: notebook lab test test-lowest coverage lint format docs docs-serve clean
 
@@ -27,10 +28,12 @@ lab: .venv/has-explore
 	$(PIP) --quiet --editable ".[$*]"
 	@touch $@
 
-# Each file has its own process, two at a time, the largest first, since what XLA has compiled stays in a process's memory.
+# Two processes at a time, the largest files first, each in its own, since what XLA has compiled stays in a process's memory.
+# They share what XLA has compiled on disk (nothing does if the path has a space).
 # The tests in a browser are skipped where there is none; `make docs` is what can require it.
 test: lint
-	(echo notebooks; ls -S tests/test_*.py) | REQUIRE_BROWSER= xargs -n 1 -P 2 $(BIN)/python -m pytest --quiet
+	(echo notebooks; ls -S tests/test_*.py | head -25; ls -S tests/test_*.py | tail -n +26 | xargs -n 7) | \
+	DQN_KERAS_CACHE="$(CURDIR)/.venv/xla" REQUIRE_BROWSER= xargs -L 1 -P 2 $(BIN)/python -m pytest --quiet
 
 # Every line of the package that a test runs, and those that none does.
 coverage: .venv/has-dev
@@ -79,7 +82,7 @@ test-on-%: .venv-%/has-test
 # $(call install,PYTHON,ENVIRONMENT,CONSTRAINTS)
 define install
 $(1) -m venv $(2)
-$(2)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(3) --editable ".[test]"
+$(2)/bin/python $(INSTALL) --quiet --constraint $(3) --editable ".[test]"
 @touch $(2)/has-test
 endef
 

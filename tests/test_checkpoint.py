@@ -75,8 +75,8 @@ def test_no_part_of_a_checkpoint_can_be_forgotten(loop, tmp_path):
 
 @pytest.mark.slow
 def test_a_corrupted_checkpoint_is_a_warning_and_the_older_one_is_used(tmp_path):
-    figures = faults.corruption_campaign(tmp_path, 300)
-    assert figures["corruptions"] > 250
+    figures = faults.corruption_campaign(tmp_path, 150)
+    assert figures["corruptions"] > 120
     assert len(figures["by way"]) == 14
     assert figures["silent"] == []
 

@@ -306,10 +306,10 @@ def corruption_campaign(folder, number, seed=0):
 def forgetting_campaign(loop, folder):
     """Returns, for each part, how a resume shows that it is missing, and that it is reset; '' if it does not."""
     folder = Path(folder)
-    run = play(loop, folder / "reference")
+    config = dataclasses.replace(CONFIG, num_episodes=80, memory_size=500)
+    run = play(loop, folder / "reference", config)
     reference = final_bits(folder / "reference")
-    half = Config(**{**vars(CONFIG), "num_episodes": 120})
-    play(loop, folder / "half", config=half)
+    play(loop, folder / "half", dataclasses.replace(config, num_episodes=40))
     arrays, facts = from_bytes(newest(folder / "half").read_bytes())
     fresh = make_agent((4,), 2, run.config, SEED)
     start_arrays, start_facts = checkpoint._arrays(fresh, []), checkpoint._counters(fresh)
@@ -324,7 +324,7 @@ def forgetting_campaign(loop, folder):
         try:
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
-                play(loop, changed_folder, seed=None)
+                play(loop, changed_folder, config, seed=None)
         except ValueError:
             return "refused"
         if final_bits(changed_folder) != reference:
