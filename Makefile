@@ -28,11 +28,15 @@ lab: .venv/has-explore
 	$(PIP) --quiet --editable ".[$*]"
 	@touch $@
 
-# Two processes at a time, the largest files first, each in its own, since what XLA has compiled stays in a process's memory.
+# Two processes at a time, what takes longest first. Large files have their own process, since what XLA has compiled stays in
+# its memory; small files share one.
 # They share what XLA has compiled on disk (nothing does if the path has a space).
 # The tests in a browser are skipped where there is none; `make docs` is what can require it.
+LONG := $(addprefix tests/test_, docs.py keras_parts.py fuzz.py)
+SHORT := $(filter-out $(LONG), $(shell ls -S tests/test_*.py))
+
 test: lint
-	(echo notebooks; ls -S tests/test_*.py | head -25; ls -S tests/test_*.py | tail -n +26 | xargs -n 7) | \
+	(printf '%s\n' notebooks $(LONG) $(wordlist 1, 22, $(SHORT)); echo $(wordlist 23, 99, $(SHORT)) | xargs -n 7) | \
 	DQN_KERAS_CACHE="$(CURDIR)/.venv/xla" REQUIRE_BROWSER= xargs -L 1 -P 2 $(BIN)/python -m pytest --quiet
 
 # Every line of the package that a test runs, and those that none does.

@@ -227,6 +227,7 @@ def _trained(
     is_interrupted = False
     with studies.kept_in(path, identities, tasks) as (outcomes, save_when_due):
         missing = [task for task in tasks if task not in outcomes]
+        missing.sort(key=lambda task: task.seed != seeds[0])  # so that each setting is compiled once for all workers
         bar = tqdm(total=len(tasks), initial=len(tasks) - len(missing), unit="seed", disable=not verbose)
         trained = results(settings, missing, engine, num_workers)
         with bar, contextlib.closing(trained), sigterm_interrupts():

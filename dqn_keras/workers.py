@@ -22,7 +22,7 @@ import numpy as np
 from gymnasium.experimental.functional import FuncEnv
 from joblib import Parallel, delayed, parallel_config
 
-from dqn_keras._engine.cache import publish
+from dqn_keras._engine.cache import fetch, publish
 from dqn_keras._engine.libraries import is_of_a_library
 from dqn_keras._engine.programs import shared_in
 from dqn_keras._engine.recycling import recycle
@@ -74,6 +74,7 @@ def results(settings: Mapping[str, Setting], tasks: Sequence[Task], engine: str,
     names = {task.name for task in tasks}
     pickled = {name: _pickled(setting) for name, setting in settings.items() if name in names}
     yield from ENGINES[engine](pickled, tasks, num_workers)
+    fetch()  # what the workers have compiled
 
 
 class _Pickled(NamedTuple):
@@ -159,6 +160,7 @@ def _train_seed_in_worker(pickled: _Pickled, task: Task) -> tuple[Task, Outcome]
     """Trains one seed in a worker, where TensorFlow gets only one thread, because each core has a worker."""
     with contextlib.suppress(RuntimeError):  # TensorFlow has started already: the worker has had a task before
         tf.config.threading.set_intra_op_parallelism_threads(1)
+    fetch()
     outcome = _train_seed(pickled, task.seed)
     publish()  # now, because a worker may be killed when the study ends
     return None if outcome is None else (task, outcome)
@@ -173,6 +175,7 @@ def _by_joblib(settings: Mapping[str, _Pickled], tasks: Sequence[Task], num_work
     # loky replaces a worker whose memory has grown, for example when an optimizer is compiled for each seed. The new
     # worker continues, and no seed is lost.
     warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor", UserWarning)
+    publish()  # what this process has compiled, for the workers
     backend = parallel_config(backend="loky", inner_max_num_threads=1)
     with backend, _compilation_cache_in_children(), _interrupts_ignored_by_children():
         parallel = Parallel(

@@ -1,11 +1,14 @@
 """The start of a process: the cache of compiled programs, the option of XLA, the garbage collector."""
 
 import hashlib
+import importlib.util
 import os
 import subprocess
 import sys
 
 import pytest
+
+from dqn_keras._engine import cache
 
 SCRIPT = """
 import gymnasium as gym
@@ -94,6 +97,40 @@ def test_processes_that_fill_the_cache_at_once_do_not_harm_each_other(tmp_path):
     assert len({name.rpartition(".")[0] for name in before}) == len(before)
 
 
+def test_running_processes_get_each_others_programs(tmp_path, monkeypatch):
+    for name in ("TF_XLA_FLAGS", "TF_CPP_MIN_LOG_LEVEL"):
+        monkeypatch.setenv(name, "")
+
+    def process():
+        """Returns another instance of the module, as another process has."""
+        spec = importlib.util.spec_from_file_location("cache", cache.__file__)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        module.use_cache(str(tmp_path))
+        return module
+
+    def compile_in(process, name, content):
+        (process._own / name).write_bytes(content * 200_000)
+
+    def shared():
+        return sorted(path.stem for path in tmp_path.glob("*/*.pb.*"))
+
+    first, second = process(), process()
+    compile_in(first, "a.pb", b"1")
+    (first._own / "small.pb").write_bytes(b"1")
+    first.publish()
+    second.fetch()
+    assert [path.name for path in second._own.iterdir()] == ["a.pb"]
+    for either in (first, second):
+        compile_in(either, "b.pb", either._own.name[-1].encode())
+        either.publish()
+    assert shared() == ["a.pb", "b.pb"]
+    (first._own.parent / "b.pb.0123").write_bytes(b"2" * 200_000)  # another process was as fast
+    first.fetch()
+    second.fetch()
+    assert shared() == ["a.pb", "b.pb"]
+
+
 KERAS_FIRST = """
 import sys
 import keras
@@ -116,36 +153,47 @@ FLAGS = """
 import gc, os
 gc.disable() if {is_off} else None
 {first}
-import dqn_keras.learn
+import dqn_keras._engine.tensorflow
 print(gc.isenabled(), os.environ.get("XLA_FLAGS"), os.environ.get("TF_XLA_FLAGS"))
 """
-IN_SILENCE = "import os; os.dup2(os.open(os.devnull, os.O_WRONLY), 2); import tensorflow"
 OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000"
+STUBS = {  # what the module needs of TensorFlow and Keras, whose import takes seconds
+    "tensorflow": "class config: list_physical_devices = list",
+    "keras": "import tensorflow\nclass backend:\n    def backend(): return 'tensorflow'",
+}
 
 
-def flags(first="", is_off=False, **environment):
-    return output(start(FLAGS.format(first=first, is_off=is_off), **{"DQN_KERAS_CACHE": "0", **environment})).strip()
+@pytest.fixture
+def flags(tmp_path_factory):
+    """Returns a function: what to do first, whether the collector is off, variables -> what holds after the import."""
+    folder = tmp_path_factory.mktemp("stubs")
+    for name, content in STUBS.items():
+        (folder / f"{name}.py").write_text(content)
+
+    def after_import(first="", is_off=False, **environment):
+        path = os.pathsep.join([str(folder), *sys.path])
+        script = FLAGS.format(first=first, is_off=is_off)
+        return output(start(script, **{"DQN_KERAS_CACHE": "0", "PYTHONPATH": path, **environment})).strip()
+
+    return after_import
 
 
-@pytest.mark.slow
-def test_the_garbage_collector_is_as_it_was():
+def test_the_garbage_collector_is_as_it_was(flags):
     assert flags().startswith("True")
     assert flags(is_off=True).startswith("False")
 
 
-@pytest.mark.slow
-def test_what_the_user_chose_stays():
+def test_what_the_user_chose_stays(flags):
     assert flags() == f"True {OPTION} None"
     assert flags(XLA_FLAGS="--xla_cpu_enable_fast_math=false") == f"True --xla_cpu_enable_fast_math=false {OPTION} None"
     chosen = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1024"
     assert flags(XLA_FLAGS=chosen) == f"True {chosen} None"
-    assert flags(first=IN_SILENCE, DQN_KERAS_CACHE="1") == f"True {OPTION} None"
+    assert flags(first="import tensorflow", DQN_KERAS_CACHE="1") == f"True {OPTION} None"
     chosen = "--tf_xla_persistent_cache_directory=/nowhere"
     assert flags(TF_XLA_FLAGS=chosen, DQN_KERAS_CACHE="1") == f"True {OPTION} {chosen}"
 
 
-@pytest.mark.slow
-def test_a_process_does_not_use_the_folder_of_its_parent(tmp_path):
+def test_a_process_does_not_use_the_folder_of_its_parent(flags, tmp_path):
     parents = f"--tf_xla_persistent_cache_directory={tmp_path}/xla-0/process-abc"
     assert flags(TF_XLA_FLAGS=f"--tf_xla_auto_jit=0 {parents}") == f"True {OPTION} --tf_xla_auto_jit=0"
     assert flags(TF_XLA_FLAGS=parents) == f"True {OPTION} None"
@@ -155,8 +203,7 @@ def test_a_process_does_not_use_the_folder_of_its_parent(tmp_path):
     assert not list(tmp_path.glob("*/process-*"))
 
 
-@pytest.mark.slow
-def test_a_folder_that_cannot_be_used_is_no_error(tmp_path):
+def test_a_folder_that_cannot_be_used_is_no_error(flags, tmp_path):
     (tmp_path / "a file").touch()
     (tmp_path / "file").touch()
     assert flags(DQN_KERAS_CACHE=str(tmp_path / "a file")) == flags(DQN_KERAS_CACHE=str(tmp_path / "file"))

@@ -1,6 +1,7 @@
 """Studies with the user's own parts, and sweeps of many settings."""
 
 import dataclasses
+import sys
 import warnings
 
 import gymnasium as gym
@@ -54,6 +55,19 @@ def rewards(studies):
 
 def digests(studies):
     return {name: [outcome.digest for outcome in x.outcomes] for name, x in studies.items()}
+
+
+def test_the_first_seed_of_each_setting_comes_first_so_that_workers_share_what_they_compile(monkeypatch):
+    tasks = []
+
+    def interrupted_at_once(settings, missing, engine, num_workers):
+        tasks.extend((task.name, task.seed) for task in missing)
+        yield None
+
+    monkeypatch.setattr(sys.modules["dqn_keras.study"], "results", interrupted_at_once)
+    with pytest.warns(UserWarning, match="4 of 4 seeds are not in this sweep"):
+        sweep(CartPole(), {"plain": QUICK, "short": QUICK}, seeds=[5, 3], verbose=0)
+    assert tasks == [("plain", 5), ("short", 5), ("plain", 3), ("short", 3)]
 
 
 @pytest.mark.parametrize("env", [CartPole(), gym.make("CartPole-v1")], ids=["functional", "Gymnasium"])

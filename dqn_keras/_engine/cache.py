@@ -2,8 +2,9 @@
 
 TensorFlow can keep such a cache, but it trusts every file in the folder and writes files in place. So each process gets
 its own folder, with copies of the files in the shared folder. Before a file is copied, it is checked by the SHA-256 in
-its name. `publish` moves new files to the shared folder. TensorFlow finds a program by its contents and by the names in
-it; `programs.py` names everything in the same way in each process.
+its name. `publish` moves new files to the shared folder, and `fetch` copies those of other processes from it.
+
+TensorFlow finds a program by its contents and by the names in it; `programs.py` gives the same names in each process.
 
 This module does not import TensorFlow, because TensorFlow reads the setting at its import.
 """
@@ -33,6 +34,10 @@ _own: Path | None = None
 """This process's folder, if it uses the cache."""
 
 
+_known: set[str] = set()
+"""The names of the shared files that this process has read or written, without the digest."""
+
+
 def use_cache(choice: str) -> None:
     """Makes TensorFlow, which must not be imported yet, keep compiled programs on disk.
 
@@ -54,29 +59,46 @@ def use_cache(choice: str) -> None:
         _own = Path(tempfile.mkdtemp(prefix="process-", dir=shared))
     except (OSError, importlib.metadata.PackageNotFoundError):  # TensorFlow may be installed under another name
         return
-    for path in shared.iterdir():
+    fetch()
+    for path in shared.glob("process-*"):
         with contextlib.suppress(OSError):  # another process has deleted it
-            if path.is_dir():
-                if path.stat().st_mtime < time.time() - _A_DAY:
-                    shutil.rmtree(path)
-            elif path.suffix[1:] == _digest(path) and not (_own / path.stem).exists():
-                shutil.copyfile(path, _own / path.stem)
-            else:  # it is damaged, or two processes have stored the same program
-                path.unlink()
+            if path.stat().st_mtime < time.time() - _A_DAY:
+                shutil.rmtree(path)
     os.environ["TF_XLA_FLAGS"] = f"{flags} {_OPTION}{_own}".strip()
     if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "2") == "2":  # the package's own default, or inherited from a parent
         os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # TensorFlow logs an error even for a file that it reads well
     atexit.register(_leave, _own, os.getpid())
 
 
+def fetch() -> None:
+    """Gets the programs that other processes have shared, before this process would compile them."""
+    if _own is None:
+        return
+    seen: set[str] = set()
+    for path in sorted(_own.parent.glob("*.pb.*")):
+        with contextlib.suppress(OSError):  # a full disk, or another process has deleted the file
+            if path.stem in seen:  # two processes have stored the same program; all processes delete the same file
+                path.unlink()
+            elif path.stem in _known:
+                seen.add(path.stem)
+            elif path.suffix[1:] == _digest(path):
+                shutil.copyfile(path, _own / path.stem)
+                seen.add(path.stem)
+                _known.add(path.stem)
+            else:  # it is damaged
+                path.unlink()
+
+
 def publish() -> None:
-    """Shares the programs that this process has compiled with later processes; of many, deletes the oldest."""
+    """Shares the programs that this process has compiled with other processes; of many, deletes the oldest."""
     if _own is None:
         return
     with contextlib.suppress(OSError):  # a full disk, or another process has deleted the file
         for path in _own.glob("*.pb"):
-            if path.stat().st_size >= _SMALLEST and not list(_own.parent.glob(f"{path.name}.*")):
-                os.replace(path, _own.parent / f"{path.name}.{_digest(path)}")
+            if path.stat().st_size >= _SMALLEST and path.name not in _known:
+                _known.add(path.name)
+                if not list(_own.parent.glob(f"{path.name}.*")):
+                    os.replace(path, _own.parent / f"{path.name}.{_digest(path)}")
         oldest_first = sorted(_own.parent.glob("*.pb.*"), key=lambda path: path.stat().st_mtime)
         for path in oldest_first[:-_MOST_FILES]:
             path.unlink()
