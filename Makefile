@@ -36,7 +36,7 @@ LONG := $(addprefix tests/test_, docs.py keras_parts.py fuzz.py)
 SHORT := $(filter-out $(LONG), $(shell ls -S tests/test_*.py))
 
 test: lint
-	(printf '%s\n' notebooks $(LONG) $(wordlist 1, 22, $(SHORT)); echo $(wordlist 23, 99, $(SHORT)) | xargs -n 7) | \
+	(printf '%s\n' notebooks $(LONG) $(wordlist 1, 22, $(SHORT)); echo $(wordlist 23, $(words $(SHORT)), $(SHORT)) | xargs -n 7) | \
 	DQN_KERAS_CACHE="$(CURDIR)/.venv/xla" REQUIRE_BROWSER= xargs -L 1 -P 2 $(BIN)/python -m pytest --quiet
 
 # Every line of the package that a test runs, and those that none does.
