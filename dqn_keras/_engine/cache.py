@@ -1,8 +1,8 @@
 """A cache on disk of the programs that XLA has compiled, so that other processes need not compile them again.
 
-TensorFlow can keep such a cache, but it trusts every file in the folder and writes files in place. So each process gets
-its own folder, with copies of the files in the shared folder. Before a file is copied, it is checked by the SHA-256 in
-its name. `publish` moves new files to the shared folder, and `fetch` copies those of other processes from it.
+TensorFlow can keep such a cache, but it trusts every file in the folder. So each process gets its own folder, with links
+to the files in the shared folder. Before a file is linked, it is checked by the SHA-256 in its name. `publish` moves new
+files to the shared folder, and `fetch` links those of other processes.
 
 TensorFlow finds a program by its contents and by the names in it; `programs.py` gives the same names in each process.
 
@@ -82,11 +82,19 @@ def fetch() -> None:
             elif path.stem in _known:
                 seen.add(path.stem)
             elif path.suffix[1:] == _digest(path):
-                shutil.copyfile(path, _own / path.stem)
+                _link(path, _own / path.stem)
                 seen.add(path.stem)
                 _known.add(path.stem)
             else:  # it is damaged
                 path.unlink()
+
+
+def _link(path: Path, target: Path) -> None:
+    """Makes `target` another name of the same file, or a copy where the file system has no such names."""
+    try:
+        os.link(path, target)
+    except OSError:
+        shutil.copyfile(path, target)
 
 
 def publish() -> None:
