@@ -165,6 +165,7 @@ import gc, os
 gc.disable() if {is_off} else None
 {first}
 import dqn_keras._engine.tensorflow
+assert gc.get_freeze_count() > 1000
 print(gc.isenabled(), os.environ.get("XLA_FLAGS"), os.environ.get("TF_XLA_FLAGS"))
 """
 OPTION = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000"
