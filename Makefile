@@ -28,15 +28,14 @@ lab: .venv/has-explore
 	$(PIP) --quiet --editable ".[$*]"
 	@touch $@
 
-# Two processes at a time, what takes longest first. Large files have their own process, since what XLA has compiled stays in
-# its memory; small files share one.
+# Two processes at a time, what takes longest first. A process has three files, since TensorFlow takes seconds to start, but
+# what XLA has compiled stays in its memory.
 # They share what XLA has compiled on disk (nothing does if the path has a space).
 # The tests in a browser are skipped where there is none; `make docs` is what can require it.
-LONG := $(addprefix tests/test_, docs.py keras_parts.py fuzz.py)
-SHORT := $(filter-out $(LONG), $(shell ls -S tests/test_*.py))
+LONG := $(addprefix tests/test_, docs.py keras_parts.py)
 
 test: lint
-	(printf '%s\n' notebooks $(LONG) $(wordlist 1, 22, $(SHORT)); echo $(wordlist 23, $(words $(SHORT)), $(SHORT)) | xargs -n 7) | \
+	(echo notebooks; echo $(LONG); echo $(filter-out $(LONG), $(shell ls -S tests/test_*.py)) | xargs -n 3) | \
 	DQN_KERAS_CACHE="$(CURDIR)/.venv/xla" REQUIRE_BROWSER= xargs -L 1 -P 2 $(BIN)/python -m pytest --quiet
 
 # Every line of the package that a test runs, and those that none does.
@@ -71,8 +70,10 @@ NEWER := $(shell for version in 3.12 3.13; do python$$version -c "" 2>/dev/null 
 
 test-lowest: $(addprefix test-on-,lowest $(NEWER))
 
+TESTS := tests
+
 test-on-%: .venv-%/has-test
-	.venv-$*/bin/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile tests
+	.venv-$*/bin/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile $(TESTS)
 
 .venv-lowest/has-test: pyproject.toml constraints-lowest.txt
 	$(call install,$(PYTHON),.venv-lowest,constraints-lowest.txt)

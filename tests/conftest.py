@@ -1,8 +1,6 @@
 import importlib
 import os
 import signal
-import subprocess
-import sys
 
 import gymnasium as gym
 import numpy as np
@@ -49,29 +47,3 @@ def random_batch(rng):
         )
 
     return make
-
-
-SCRIPT = """
-import gymnasium as gym
-from dqn_keras import train
-from dqn_keras.environments import CartPole
-from tests.helpers.runs import QUICK, fingerprint
-print(fingerprint(train({env}, QUICK, seed={seed}, verbose=0)))
-"""
-
-
-@pytest.fixture
-def in_another_process():
-    """Returns a function: (expression that makes an env, seed) -> fingerprint of a quick run in a fresh process."""
-
-    def run(env, seed):
-        return subprocess.run(
-            [sys.executable, "-c", SCRIPT.format(env=env, seed=seed)],
-            env={**os.environ, "PYTHONHASHSEED": str(seed)},
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=600,
-        ).stdout.strip()
-
-    return run

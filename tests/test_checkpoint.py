@@ -41,17 +41,17 @@ def test_a_run_resumed_three_times_ends_with_the_bits_of_an_uninterrupted_one(lo
 
 @pytest.mark.slow
 def test_killed_runs_end_with_the_bits_of_an_uninterrupted_one(tmp_path):
-    figures = faults.kill_campaign(tmp_path, num_kills=8, num_in_saves=4, kills_per_run=4)
-    assert figures["kills"] == 8
-    assert figures["of them inside a save"] >= 4
+    figures = faults.kill_campaign(tmp_path, num_kills=4, num_in_saves=2, kills_per_run=2)
+    assert figures["kills"] == 4
+    assert figures["of them inside a save"] >= 2
     assert figures["differing runs"] == 0
 
 
 @pytest.mark.slow
 def test_killed_runs_with_own_parts_end_with_the_bits_of_an_uninterrupted_one(tmp_path):
     cases = (("Gymnasium loop", "LSTM, own targets"), ("compiled episodes", "convolution, own loss"))
-    figures = faults.kill_campaign(tmp_path, num_kills=4, num_in_saves=2, kills_per_run=2, cases=cases)
-    assert figures["kills"] == 4
+    figures = faults.kill_campaign(tmp_path, num_kills=2, num_in_saves=1, kills_per_run=1, cases=cases)
+    assert figures["kills"] == 2
     assert figures["differing runs"] == 0
 
 
@@ -378,15 +378,16 @@ for loop in LOOPS:
 
 @pytest.mark.slow
 def test_fresh_processes_with_other_threads_and_hash_seeds_give_the_same_bits(tmp_path):
-    results = set()
-    for threads, hash_seed in [(1, 0), (2, 1), (2, 2)]:
+    for loop in LOOPS:
+        play(loop, tmp_path / loop, QUICK)
+    here = [final_bits(tmp_path / loop) for loop in LOOPS]
+    for threads, hash_seed in [(1, 0), (2, 1)]:
         numbers = {f"TF_NUM_{kind}OP_THREADS": str(threads) for kind in ("INTRA", "INTER")}
         environment = {**os.environ, **numbers, "PYTHONHASHSEED": str(hash_seed)}
         folder = tmp_path / f"{threads} {hash_seed}"
         command = [sys.executable, "-c", BITS, folder]
-        results.add(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
-    assert len(results) == 1
-    assert len(results.pop().split()) == 2
+        printed = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+        assert printed.split() == here
 
 
 # The network alone

@@ -197,16 +197,9 @@ def test_one_seed_gives_the_same_bits_however_many_episodes_a_call_plays():
     assert prints[0] == prints[1] == prints[2]
 
 
-@pytest.mark.slow
-def test_one_seed_gives_the_same_bits_in_another_process_and_another_seed_does_not(in_another_process):
-    here = fingerprint(train(CartPole(), QUICK, seed=5, verbose=0))
-    assert in_another_process("CartPole()", seed=5) == here
-    assert in_another_process("CartPole()", seed=6) != here
-
-
-def test_an_agent_before_it_changes_nothing():
+def test_a_run_depends_on_its_seed_and_not_on_a_run_before_it():
     alone = fingerprint(train(CartPole(), QUICK, seed=1, verbose=0))
-    train(CartPole(), QUICK, seed=2, verbose=0)
+    assert fingerprint(train(CartPole(), QUICK, seed=2, verbose=0)) != alone
     assert fingerprint(train(CartPole(), QUICK, seed=1, verbose=0)) == alone
 
 

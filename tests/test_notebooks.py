@@ -76,6 +76,8 @@ def test_a_cell_that_is_run_twice_does_no_harm(capsys, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.chdir(NOTEBOOKS)
     cells = [cell.source for cell in rendered(NOTEBOOKS / "deep_q_network.py").cells if cell.cell_type == "code"]
+    assert sum("config = Config()" in cell for cell in cells) == 1
+    cells = [cell.replace("Config()", "Config(solved_reward=120)") for cell in cells]  # for shorter runs
     namespace, lines = {}, []
     for cell in cells[: next(i for i, cell in enumerate(cells) if "sweep(" in cell)]:
         for _ in range(2):

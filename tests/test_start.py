@@ -49,12 +49,16 @@ def kept(folder):
 
 
 @pytest.mark.slow
-def test_a_cache_is_filled_and_used_and_changes_no_bit(tmp_path):
+def test_a_cache_is_filled_used_and_repaired_and_changes_no_bit(tmp_path):
     plain = output(start(DQN_KERAS_CACHE="0"))
     first, second = (output(start(SCRIPT + PROGRAMS, DQN_KERAS_CACHE=str(tmp_path))) for _ in range(2))
     assert first == second  # a program that is compiled again has other bytes
     assert first.startswith(plain)
-    assert len(first.splitlines()) == 1 + len(kept(tmp_path)) > 1
+    assert len(first.splitlines()) == 1 + len(before := kept(tmp_path)) > 1
+    for path in tmp_path.glob("*/*"):
+        path.write_bytes(path.read_bytes()[:-100])
+    assert output(start(DQN_KERAS_CACHE=str(tmp_path))) == plain
+    assert len(kept(tmp_path)) == len(before)
 
 
 OTHER_WORK = """
@@ -71,25 +75,14 @@ train(CartPole(), Config(num_episodes=3, batch_size=2), seed=0, q_network=q_netw
 
 @pytest.mark.slow
 def test_a_program_is_found_whatever_the_process_did_before(tmp_path):
-    for amount in (0, 1, 3):
+    for amount in (0, 3):
         output(start(OTHER_WORK.format(amount=amount), DQN_KERAS_CACHE=str(tmp_path)))
         assert len(kept(tmp_path)) == 1
 
 
 @pytest.mark.slow
-def test_a_file_of_the_cache_that_is_not_whole_is_made_again(tmp_path):
-    plain = output(start(DQN_KERAS_CACHE=str(tmp_path)))
-    first = kept(tmp_path)
-    for path in tmp_path.glob("*/*"):
-        path.write_bytes(path.read_bytes()[:-100])
-    assert output(start(DQN_KERAS_CACHE=str(tmp_path))) == plain
-    assert len(kept(tmp_path)) == len(first)
-    assert output(start(DQN_KERAS_CACHE=str(tmp_path))) == plain
-
-
-@pytest.mark.slow
 def test_processes_that_fill_the_cache_at_once_do_not_harm_each_other(tmp_path):
-    assert len({output(process) for process in [start(DQN_KERAS_CACHE=str(tmp_path)) for _ in range(3)]}) == 1
+    assert len({output(process) for process in [start(DQN_KERAS_CACHE=str(tmp_path)) for _ in range(2)]}) == 1
     output(start(DQN_KERAS_CACHE=str(tmp_path)))
     before = kept(tmp_path)
     output(start(DQN_KERAS_CACHE=str(tmp_path)))

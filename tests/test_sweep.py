@@ -1,13 +1,18 @@
 """Studies with the user's own parts, and sweeps of many settings."""
 
+import contextlib
 import dataclasses
+import os
 import sys
+import threading
+import time
 import warnings
 
 import gymnasium as gym
 import keras
 import matplotlib.pyplot as plt
 import numpy as np
+import psutil
 import pytest
 
 from dqn_keras import (
@@ -43,6 +48,9 @@ def sgd():
 
 OWN = {"q_network": network, "optimizer": sgd, "targets": double_td_targets, "loss": "huber"}
 SETTINGS = {"plain": QUICK, "short": dataclasses.replace(QUICK, max_steps=10), "own": {"config": QUICK, **OWN}}
+
+
+ENVIRONMENTS = {"functional": CartPole, "Gymnasium": lambda: gym.make("CartPole-v1")}
 
 
 def weights(run):
@@ -99,24 +107,23 @@ def scheduled(first_rate):
 
 
 @pytest.mark.parametrize(
-    ("makers", "num_traces"),
+    ("env", "makers", "num_traces"),
     [
-        pytest.param([clipped] * 3, 1, id="equal"),
-        pytest.param([clipped, lambda: clipped(0.1), clipped], 2, id="a setting differs"),
+        pytest.param("Gymnasium", [clipped] * 3, 1, id="equal"),
+        pytest.param("Gymnasium", [clipped, lambda: clipped(0.1), clipped], 2, id="a setting differs"),
         pytest.param(
-            [lambda: scheduled(0.5), lambda: scheduled(0.2), lambda: scheduled(0.5)], 2, id="a schedule differs"
+            "Gymnasium",
+            [lambda: scheduled(0.5), lambda: scheduled(0.2), lambda: scheduled(0.5)],
+            2,
+            id="a schedule differs",
         ),
-        pytest.param([clipped, backwards, backwards], 3, id="a method of the user's"),
-    ],
-)
-@pytest.mark.parametrize(
-    "env",
-    [
-        pytest.param(CartPole(), id="functional", marks=pytest.mark.slow),
-        pytest.param(gym.make("CartPole-v1"), id="Gym"),
+        pytest.param("Gymnasium", [clipped, backwards, backwards], 3, id="a method of the user's"),
+        pytest.param("functional", [clipped, clipped, backwards], 2, id="functional", marks=pytest.mark.slow),
     ],
 )
 def test_seeds_share_a_trace_if_their_optimizers_are_keras_with_equal_settings(env, makers, num_traces, monkeypatch):
+    env = ENVIRONMENTS[env]()
+
     def run_all():
         return [weights(train(env, QUICK, seed, optimizer=make(), verbose=0)) for seed, make in enumerate(makers)]
 
@@ -138,10 +145,50 @@ def test_a_sweep_equals_its_studies_in_any_process():
     assert len({digest for row in digests(found).values() for digest in row}) == 9
 
 
+def kill_a_busy_worker(killed):
+    """Kills the first process that trains a seed."""
+    deadline = time.monotonic() + 600
+    while not killed and time.monotonic() < deadline:
+        for process in psutil.Process().children(recursive=True):
+            with contextlib.suppress(psutil.Error):  # it has ended
+                if "ray::_train_seed" in " ".join(process.cmdline()):
+                    process.kill()
+                    killed.append(process.pid)
+                    return
+        time.sleep(0.05)
+
+
 @pytest.mark.slow
-def test_ray_makes_the_same_sweep():
-    by_ray = sweep(CartPole(), SETTINGS, range(2), engine="ray", verbose=0)
+def test_a_cluster_of_two_nodes_loses_a_worker_and_the_numbers_are_the_same(monkeypatch):
+    import ray
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("PYTHONPATH", os.getcwd(), prepend=os.pathsep)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        cluster.add_node(num_cpus=1)
+        ray.init(address=cluster.address, log_to_driver=False)
+        assert len(ray.nodes()) == 2
+        killed = []
+        killer = threading.Thread(target=kill_a_busy_worker, args=(killed,))
+        killer.start()
+        by_ray = sweep(CartPole(), SETTINGS, range(2), engine="ray", verbose=0)
+        killer.join()
+        assert len(killed) == 1
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
     assert digests(by_ray) == digests(sweep(CartPole(), SETTINGS, range(2), num_workers=1, verbose=0))
+
+
+@pytest.mark.slow
+def test_ray_is_started_if_it_does_not_run_and_stopped_again():
+    import ray
+
+    by_ray = study(gym.make("CartPole-v1"), QUICK, [0], engine="ray", verbose=0)
+    assert not ray.is_initialized()
+    here = study(gym.make("CartPole-v1"), QUICK, [0], num_workers=1, verbose=0)
+    assert by_ray.outcomes[0].digest == here.outcomes[0].digest
 
 
 @pytest.mark.slow

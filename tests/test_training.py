@@ -37,13 +37,6 @@ def test_the_stop_rule_needs_more_than_solved_reward_not_as_much():
     assert train(Corridor(length=100, limit=4), config, seed=0, verbose=0).solved_at is None
 
 
-@pytest.mark.slow
-def test_one_seed_gives_the_same_bits_in_another_process_and_another_seed_does_not(cartpole, in_another_process):
-    here = fingerprint(train(cartpole, QUICK, seed=5, verbose=0))
-    assert in_another_process("gym.make('CartPole-v1')", seed=5) == here
-    assert in_another_process("gym.make('CartPole-v1')", seed=6) != here
-
-
 def test_without_a_seed_a_new_one_is_drawn_that_can_be_used_again(cartpole):
     first, second = (train(cartpole, QUICK, verbose=0) for _ in range(2))
     assert first.seed != second.seed

@@ -1,8 +1,8 @@
 """A cache on disk of the programs that XLA has compiled, so that other processes need not compile them again.
 
-TensorFlow can keep such a cache, but it trusts every file in the folder. So each process gets its own folder, with links
-to the files in the shared folder. Before a file is linked, it is checked by the SHA-256 in its name. `publish` moves new
-files to the shared folder, and `fetch` links those of other processes.
+TensorFlow can keep such a cache, but it trusts every file in the folder. So each process gets its own folder, with
+links to the files in the shared folder. Before a file is linked, it is checked by the SHA-256 in its name. `publish`
+moves new files to the shared folder, and `fetch` links those of other processes.
 
 TensorFlow finds a program by its contents and by the names in it; `programs.py` gives the same names in each process.
 
