@@ -6,6 +6,9 @@ BIN := .venv/bin
 INSTALL := -m pip install --no-compile --disable-pip-version-check
 PIP := $(BIN)/python $(INSTALL) --constraint constraints.txt
 
+# Modules are compiled when they are first imported, not when they are installed. Python must keep what it compiles.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: notebook lab test test-lowest coverage lint format docs docs-serve clean
 
 # Each of these files says that .venv holds one extra of the package.
