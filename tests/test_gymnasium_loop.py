@@ -61,11 +61,17 @@ PUBLISHED = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seed", "parameters"),
-    [(0, {}), (1, {}), (2, {"memory_size": 500}), (3, OTHERS), (4, PUBLISHED)],
-    ids=["seed 0", "seed 1", "full memory", "other parameters", "a published rhythm"],
+    ("seed", "parameters", "jit_compile"),
+    [
+        pytest.param(0, {}, True, id="seed 0"),
+        pytest.param(1, {}, True, id="seed 1"),
+        pytest.param(2, {"memory_size": 500}, True, id="full memory"),
+        pytest.param(3, OTHERS, True, id="other parameters"),
+        pytest.param(4, PUBLISHED, True, id="a published rhythm"),
+        pytest.param(0, {}, False, id="seed 0, no jit"),
+        pytest.param(3, OTHERS, False, id="other parameters, no jit"),
+    ],
 )
-@pytest.mark.parametrize("jit_compile", [True, False], ids=["jit", "no jit"])
 def test_the_loop_is_the_originals_algorithm_step_for_step(cartpole, seed, parameters, jit_compile):
     env = Recorded(cartpole)
     config = Config(**parameters, jit_compile=jit_compile)

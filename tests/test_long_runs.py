@@ -7,7 +7,7 @@ from tests.helpers.long_runs import long_runs
 
 @pytest.mark.slow
 def test_memory_stays_flat_and_nothing_is_left_after_many_agents_runs_and_studies():
-    figures = long_runs(num_agents=150, num_trains=60, num_studies=20, num_in_workers=3)
+    figures = long_runs(num_agents=150, num_trains=40, num_studies=20, num_in_workers=2)
     left = {name: number for name, number in figures.items() if name.endswith("left") and number > 0}
     assert not left
     growing = {name: megabytes for name, megabytes in figures.items() if name.startswith("MB")}

@@ -25,7 +25,7 @@ import platformdirs
 from dqn_keras._engine.machine import processor
 
 _OPTION = "--tf_xla_persistent_cache_directory="
-_MOST_FILES = 100  # of about 1.5 MB each
+_MOST_FILES = 300  # of 0.1 to 1.6 MB each
 _SMALLEST = 100_000  # bytes; smaller programs are compiled at once, and TensorFlow gives them other names each time
 _A_DAY = 24 * 60 * 60  # the folder of a killed process is deleted after this time
 
