@@ -173,12 +173,13 @@ def test_a_study_is_saved_continued_and_drawn(capsys):
 @pytest.mark.slow
 def test_a_sweep_is_saved_continued_and_drawn(capsys):
     line = "sweep CartPole-v1 --compiled --out s --workers 1 --num-episodes 60 --evaluate --quiet"
-    assert dqn_keras(f"{line} --vary hidden_units=8,8x8 double=False,True --seeds 1") == 0
+    assert dqn_keras(f"{line} --vary hidden_units=8x8 double=False,True tau=0.1,0.5 --seeds 1") == 0
     table = capsys.readouterr().out
-    names = [f"hidden_units={units} double={double}" for units in ("8", "8x8") for double in (False, True)]
+    names = [f"hidden_units=8x8 double={double} tau={tau}" for double in (False, True) for tau in (0.1, 0.5)]
     assert all(f"| {name} | 1 |" in table for name in names)
     kept = load_sweep("s/sweep.npz")
-    assert [kept[name].config.hidden_units for name in names] == [(8,), (8,), (8, 8), (8, 8)]
+    assert [kept[name].config.hidden_units for name in names] == [(8, 8)] * 4
+    assert [kept[name].config.tau for name in names] == [0.1, 0.5, 0.1, 0.5]
     assert len({study.outcomes[0].digest for study in kept.values()}) == 4
     assert np.isfinite(kept[names[0]].greedy_returns).all()
     with Path("s/sweep.csv").open() as file:
