@@ -31,15 +31,15 @@ lab: .venv/has-explore
 	$(PIP) --quiet --editable ".[$*]"
 	@touch $@
 
-# Three processes at a time, since some wait for others, and what takes longest first. A process has three files, since
-# TensorFlow takes seconds to start, but what XLA has compiled stays in its memory.
+# Two processes at a time, what takes longest first. A process has three files, since TensorFlow takes seconds to start, but
+# what XLA has compiled stays in its memory.
 # They share what XLA has compiled on disk (nothing does if the path has a space).
 # The tests in a browser are skipped where there is none; `make docs` is what can require it.
 LONG := $(addprefix tests/test_, docs.py keras_parts.py)
 
 test: lint
 	(echo notebooks; echo $(LONG); echo $(filter-out $(LONG), $(shell ls -S tests/test_*.py)) | xargs -n 3) | \
-	DQN_KERAS_CACHE="$(CURDIR)/.venv/xla" REQUIRE_BROWSER= xargs -L 1 -P 3 $(BIN)/python -m pytest --quiet
+	DQN_KERAS_CACHE="$(CURDIR)/.venv/xla" REQUIRE_BROWSER= xargs -L 1 -P 2 $(BIN)/python -m pytest --quiet
 
 # Every line of the package that a test runs, and those that none does.
 coverage: .venv/has-dev
